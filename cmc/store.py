@@ -1,0 +1,176 @@
+"""Assets, checkpoints and results on disk, without pickle and without half-written files.
+
+A checkpoint is one safetensors file whose header carries a JSON record (study, method,
+configuration, seeds, versions, command, commit). A result is one JSON file with the same record.
+Every file is written to a temporary name, flushed, and renamed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+_FORMAT = "cmc-checkpoint-1"
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that is missing, damaged, foreign, or of another study or configuration."""
+
+
+def asset(*parts: str) -> Path:
+    """Path of a shipped asset, in a checkout or in an installed wheel.
+
+    Raises:
+        FileNotFoundError: if no such asset is shipped.
+    """
+    package = Path(__file__).resolve().parent
+    for root in (package / "assets", package.parent / "assets"):
+        if root.joinpath(*parts).exists():
+            return root.joinpath(*parts)
+    raise FileNotFoundError(f"no asset {'/'.join(parts)!r} is shipped with cmc")
+
+
+def write_atomic(path: str | Path, write: Callable[[IO[bytes]], Any]) -> Path:
+    """Write a file through a temporary name in the same folder, then rename it.
+
+    If writing fails (a full disk, an interrupt), the earlier file is untouched and the temporary
+    one is removed.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)  # mkstemp makes private files; assets are shared
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    return path
+
+
+def write_json(path: str | Path, content: Mapping[str, Any]) -> Path:
+    """Write `content` as JSON (NaN and infinity are refused), atomically."""
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    return write_atomic(path, lambda file: file.write(text.encode()))
+
+
+def read_json(path: str | Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        ValueError: if the file does not hold one JSON object.
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{path} is not JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: wanted a JSON object, found {type(content).__name__}")
+    return content
+
+
+def provenance(command: str, seeds: list[int]) -> dict[str, Any]:
+    """What produced a file: the command, seeds, commit and versions."""
+    packages = ("numpy", "scipy", "torch", "mujoco", "gymnasium")
+    versions = {"python": platform.python_version()}
+    for name in packages:
+        if name in sys.modules:
+            versions[name] = metadata.version(name)
+    return {"command": command, "seeds": seeds, "commit": _commit(), "versions": versions}
+
+
+def _commit() -> str:
+    """Commit of the checkout, with `+changes` if it is not clean; `unknown` outside of one."""
+    here = Path(__file__).resolve().parent
+    try:
+        run = [
+            subprocess.run(["git", *words], cwd=here, capture_output=True, text=True, check=True)
+            for words in (["rev-parse", "--short=12", "HEAD"], ["status", "--porcelain", "--", "."])
+        ]
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return run[0].stdout.strip() + ("+changes" if run[1].stdout.strip() else "")
+
+
+def save_checkpoint(
+    path: str | Path, tensors: Mapping[str, np.ndarray], record: Mapping[str, Any]
+) -> Path:
+    """Write arrays and their JSON record as one safetensors file, atomically.
+
+    Args:
+        path: where to write; its folder is made.
+        tensors: name to array, all finite.
+        record: JSON record; must hold `study` and `method`.
+
+    Raises:
+        ValueError: if an array is not finite or the record lacks `study` or `method`.
+    """
+    from safetensors.numpy import save
+
+    missing = {"study", "method"} - set(record)
+    if missing:
+        raise ValueError(f"the checkpoint record lacks {sorted(missing)}")
+    arrays = {name: np.ascontiguousarray(array) for name, array in tensors.items()}
+    for name, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"tensor {name!r} is not finite: nothing was written to {path}")
+    header = {"format": _FORMAT, "record": json.dumps(dict(record), allow_nan=False)}
+    data = save(arrays, metadata=header)
+    return write_atomic(path, lambda file: file.write(data))
+
+
+def load_checkpoint(
+    path: str | Path, *, study: str | None = None, method: str | None = None
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read a checkpoint written by `save_checkpoint`.
+
+    Args:
+        path: the file.
+        study: if given, the study it must belong to.
+        method: if given, the method it must have been trained with.
+
+    Returns:
+        The arrays by name, and the record.
+
+    Raises:
+        CheckpointError: if it is missing, truncated, pickled, foreign or of another study/method.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"no checkpoint at {path}")
+    try:
+        with safe_open(path, framework="np") as file:
+            header = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except SafetensorError as error:
+        raise CheckpointError(
+            f"{path} is not a complete safetensors file ({error}); "
+            "truncated, pickled and foreign files are refused"
+        ) from error
+    if header.get("format") != _FORMAT:
+        raise CheckpointError(
+            f"{path}: wanted a file of format {_FORMAT!r}, found {header.get('format')!r}"
+        )
+    record = json.loads(header["record"])
+    for key, wanted in (("study", study), ("method", method)):
+        if wanted is not None and record.get(key) != wanted:
+            raise CheckpointError(
+                f"{path}: wanted a checkpoint of {key} {wanted!r}, found {record.get(key)!r}"
+            )
+    return tensors, record

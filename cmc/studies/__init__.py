@@ -1,0 +1,1 @@
+"""Studies: a frozen configuration, `train`, `evaluate` and `load` each."""

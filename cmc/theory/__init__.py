@@ -1,0 +1,1 @@
+"""Contraction, auxiliary spaces, combinations and certificates (numpy and scipy only)."""

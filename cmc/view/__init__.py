@@ -1,0 +1,1 @@
+"""Plots, sliders and 3D playback: arrays in, pictures out."""
