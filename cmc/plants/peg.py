@@ -1,0 +1,134 @@
+"""The paper's two-dimensional peg: two lags behind a surface that pushes back (appendix F)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmc.plants.base import Array, Plant, parameter
+
+
+class Peg(Plant):
+    """Slide a peg along x and press it on a surface with a wanted force.
+
+        tau_x x' + x = u_x,   tau_z z' + z = u_z,   force = K_sur min(z - g(x), 0) <= 0
+
+    with the surface g(x) = surface_sin sin x + surface_cos cos x. The latent signal is (x, force).
+    `f`, `f_y` and `f_u` are the model IN CONTACT: out of contact the force stays zero, its row of
+    f_u vanishes and no theorem about f_u^-1 applies. `step` is the plant itself, contact or not.
+
+    Parameters may be arrays that broadcast over the batch axes of y.
+
+    Args:
+        tau_x: Time constant along the surface, s.
+        tau_z: Time constant across the surface, s.
+        K_sur: Stiffness of the surface, force per length (the paper gives no units).
+        surface_sin: Coefficient of sin x in the surface.
+        surface_cos: Coefficient of cos x in the surface.
+    """
+
+    name = "peg"
+    state_names = ("x", "force")
+    units = ("length", "force")
+    x_range = (1.0, 3.0)
+    z_range = (-3.0, 1.0)
+
+    def __init__(
+        self,
+        tau_x: ArrayLike = 0.0437,
+        tau_z: ArrayLike = 0.01,
+        K_sur: ArrayLike = 16.0,
+        surface_sin: ArrayLike = 0.01,
+        surface_cos: ArrayLike = -0.01,
+    ) -> None:
+        self.tau_x = parameter("tau_x", tau_x, positive=True)
+        self.tau_z = parameter("tau_z", tau_z, positive=True)
+        self.K_sur = parameter("K_sur", K_sur, positive=True)
+        self.surface_sin = parameter("surface_sin", surface_sin)
+        self.surface_cos = parameter("surface_cos", surface_cos)
+        steepest = self.K_sur * (self.z_range[0] - np.hypot(self.surface_sin, self.surface_cos))
+        self.y_low = np.array([self.x_range[0], float(np.min(steepest))])
+        self.y_high = np.array([self.x_range[1], 0.0])
+        self.u_low = np.array([self.x_range[0], self.z_range[0]])
+        self.u_high = np.array([self.x_range[1], self.z_range[1]])
+
+    def surface(self, x: ArrayLike) -> Array:
+        """Height of the surface g(x)."""
+        return self.surface_sin * np.sin(x) + self.surface_cos * np.cos(x)
+
+    def surface_slope(self, x: ArrayLike) -> Array:
+        """Slope of the surface g'(x)."""
+        return self.surface_sin * np.cos(x) - self.surface_cos * np.sin(x)
+
+    def contact_force(self, x: ArrayLike, z: ArrayLike) -> Array:
+        """Force of the surface on the peg, K_sur min(z - g(x), 0): never positive."""
+        return self.K_sur * np.minimum(np.asarray(z, dtype=float) - self.surface(x), 0.0)
+
+    def height(self, x: ArrayLike, force: ArrayLike) -> Array:
+        """Height z that gives `force` in contact: z = force / K_sur + g(x)."""
+        return np.asarray(force, dtype=float) / self.K_sur + self.surface(x)
+
+    def step(self, x: ArrayLike, z: ArrayLike, u: ArrayLike, h: float) -> tuple[Array, Array]:
+        """Positions after `h` seconds under a held command: exact, since both lags are linear.
+
+        Args:
+            x: Position along the surface, (...).
+            z: Height, (...).
+            u: Command (u_x, u_z), (..., 2).
+            h: Sample time, s.
+
+        Returns:
+            The new x and z, each (...).
+        """
+        if not h > 0:
+            raise ValueError(f"h needs a positive sample time in seconds, got {h}")
+        x, u = np.asarray(x, dtype=float), np.asarray(u, dtype=float)
+        if u.ndim == 0 or u.shape[-1] != 2:
+            raise ValueError(f"peg: u needs shape (..., 2), got {u.shape}")
+        z = np.asarray(z, dtype=float)
+        x_new = u[..., 0] + (x - u[..., 0]) * np.exp(-h / self.tau_x)
+        z_new = u[..., 1] + (z - u[..., 1]) * np.exp(-h / self.tau_z)
+        return x_new, z_new
+
+    def f(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> Array:
+        """Derivative of (x, force) in contact, (..., 2)."""
+        y, u = self._pair(y, u)
+        x, force = y[..., 0], y[..., 1]
+        x_dot = (u[..., 0] - x) / self.tau_x
+        z_dot = (u[..., 1] - self.height(x, force)) / self.tau_z
+        force_dot = self.K_sur * (z_dot - self.surface_slope(x) * x_dot)
+        return np.stack(np.broadcast_arrays(x_dot, force_dot), axis=-1)
+
+    def f_y(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> Array:
+        """Exact Jacobian in (x, force), lower triangular, (..., 2, 2).
+
+        The paper replaces g'(x) in the lower left entry by g(x)/x and drops the terms with g'';
+        `f_y_paper` keeps that form for comparison.
+        """
+        y, u = self._pair(y, u)
+        x, slope = y[..., 0], self.surface_slope(y[..., 0])
+        # g'' = -g for this surface
+        bend = -self.surface(x)
+        lower = self.K_sur * ((bend * (x - u[..., 0]) + slope) / self.tau_x - slope / self.tau_z)
+        return _lower_triangular(-1 / self.tau_x, lower, -1 / self.tau_z)
+
+    def f_y_paper(self, y: ArrayLike) -> Array:
+        """The paper's approximation of f_y (appendix F); its lower left sign is often wrong."""
+        x = np.asarray(y, dtype=float)[..., 0]
+        slope, secant = self.surface_slope(x), self.surface(x) / x
+        lower = self.K_sur * (slope / self.tau_x - secant / self.tau_z)
+        return _lower_triangular(-1 / self.tau_x, lower, -1 / self.tau_z)
+
+    def f_u(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> Array:
+        """Jacobian in (u_x, u_z) in contact, lower triangular, (..., 2, 2)."""
+        y, u = self._pair(y, u)
+        lower = -self.K_sur * self.surface_slope(y[..., 0]) / self.tau_x
+        return _lower_triangular(1 / self.tau_x, lower, self.K_sur / self.tau_z)
+
+
+def _lower_triangular(first: ArrayLike, lower: Array, second: ArrayLike) -> Array:
+    """[[first, 0], [lower, second]] with broadcast batch axes, (..., 2, 2)."""
+    a, b, c = np.broadcast_arrays(first, lower, second)
+    matrix = np.zeros((*b.shape, 2, 2))
+    matrix[..., 0, 0], matrix[..., 1, 0], matrix[..., 1, 1] = a, b, c
+    return matrix
