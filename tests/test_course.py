@@ -1,0 +1,127 @@
+"""`make course`: what it checks before it opens JupyterLab, and what JupyterLab then serves."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from cmc import course
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture
+def taken_port():
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        yield holder.getsockname()[1]
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_a_taken_port_gets_one_sentence(taken_port: int, capsys) -> None:
+    assert course.main(["--port", str(taken_port)]) == 2
+    (line,) = capsys.readouterr().out.splitlines()
+    assert f"Port {taken_port} is taken" in line
+    assert "make course PORT=" in line
+
+
+def test_a_number_that_is_no_port_gets_one_sentence(capsys) -> None:
+    assert course.main(["--port", "70000"]) == 2
+    assert "not a port" in capsys.readouterr().out
+
+
+def test_root_and_headless_are_arguments_of_the_lab() -> None:
+    plain = course.lab_arguments(Path("notebooks"), 8888, root=False, browser=True)
+    root = course.lab_arguments(Path("notebooks"), 8888, root=True, browser=False)
+    assert set(root) - set(plain) == {"--allow-root", "--no-browser"}
+    assert "--ServerApp.ip=127.0.0.1" in plain
+
+
+def test_the_lab_serves_the_first_notebook_on_loopback_with_a_token(tmp_path: Path) -> None:
+    port = free_port()
+    environment = {**os.environ, "JUPYTER_TOKEN": "letmein", "HOME": str(tmp_path)}
+    server = subprocess.Popen(
+        [sys.executable, "-m", "cmc.course", "--no-browser", "--port", str(port)],
+        env=environment,
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        url = f"http://127.0.0.1:{port}/api/contents/{course.FIRST}?content=0"
+        wait_for(f"http://127.0.0.1:{port}/api", server)
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(url, timeout=10)
+        with urllib.request.urlopen(f"{url}&token=letmein", timeout=10) as answer:
+            assert course.FIRST in answer.read().decode()
+    finally:
+        server.terminate()
+        server.wait(timeout=30)
+
+
+def wait_for(url: str, server: subprocess.Popen, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        assert server.poll() is None, "the server ended by itself"
+        try:
+            urllib.request.urlopen(url, timeout=5).close()
+        except urllib.error.HTTPError:
+            return
+        except OSError:
+            time.sleep(0.3)
+        else:
+            return
+    raise AssertionError(f"nothing answered at {url} within {seconds} s")
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    for name in ("Makefile", "pyproject.toml", "constraints.txt"):
+        shutil.copy(ROOT / name, tmp_path)
+    return tmp_path
+
+
+def fake_python(folder: Path, script: str) -> Path:
+    path = folder / "fake-python"
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    return path
+
+
+def make_course(folder: Path, python: str) -> list[str]:
+    run = subprocess.run(
+        ["make", "--no-print-directory", "course", f"PYTHON={python}"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode != 0
+    assert not (folder / ".venv" / ".made").exists()
+    return run.stdout.splitlines()
+
+
+def test_no_python_an_old_one_and_one_without_venv_get_one_sentence(checkout: Path) -> None:
+    assert "No missing-python on the PATH" in make_course(checkout, "missing-python")[-1]
+    old = fake_python(checkout, 'case "$1" in -V) echo Python 3.9.2;; *) exit 1;; esac')
+    (line,) = make_course(checkout, str(old))
+    assert "Python 3.9.2" in line
+    assert "needs Python 3.11" in line
+    bare = fake_python(checkout, 'case "$2" in *ensurepip*) exit 1;; *) exit 0;; esac')
+    (line,) = make_course(checkout, str(bare))
+    assert "lacks the venv module" in line
