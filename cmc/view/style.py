@@ -1,0 +1,182 @@
+"""One look for every figure, and one line of text under each of them.
+
+Colors are Okabe and Ito's (https://jfly.uni-koeln.de/color/), which stay apart for the common
+forms of color blindness.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+from cycler import cycler
+
+from cmc.store import write_atomic
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLORS = {
+    "blue": "#0072B2",
+    "vermillion": "#D55E00",
+    "green": "#009E73",
+    "purple": "#CC79A7",
+    "orange": "#E69F00",
+    "sky": "#56B4E9",
+    "yellow": "#F0E442",
+    "black": "#222222",
+}
+"""Okabe-Ito colors by name, in the order of the cycle (yellow and black last)."""
+
+CYCLE = tuple(COLORS.values())
+GOOD, BAD, NEUTRAL = COLORS["blue"], COLORS["vermillion"], "#7A7A7A"
+"""What holds, what fails, and what is only there for reference."""
+
+_DPI = 144
+_CSS_PIXELS_PER_INCH = 84
+
+
+def use_style() -> None:
+    """Set matplotlib's defaults for the course (colors, fonts, grid, layout)."""
+    mpl.rcParams.update(
+        {
+            "axes.prop_cycle": cycler(color=CYCLE),
+            "figure.figsize": (7.0, 3.6),
+            "figure.dpi": 100,
+            "savefig.dpi": _DPI,
+            "figure.constrained_layout.use": True,
+            "figure.facecolor": "white",
+            "font.family": "DejaVu Sans",
+            "font.size": 11,
+            "mathtext.fontset": "dejavusans",
+            "axes.titlesize": 12,
+            "axes.titlelocation": "left",
+            "axes.labelsize": 11,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "axes.edgecolor": "#555555",
+            "axes.grid": True,
+            "axes.axisbelow": True,
+            "grid.color": "#E4E4E4",
+            "grid.linewidth": 0.8,
+            "lines.linewidth": 1.8,
+            "legend.frameon": False,
+            "legend.fontsize": 10,
+            "xtick.color": "#444444",
+            "ytick.color": "#444444",
+            "image.cmap": "cividis",
+        }
+    )
+
+
+def panels(
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    width: float = 7.5,
+    height: float | None = None,
+    **kwargs: Any,
+) -> tuple[Figure, np.ndarray]:
+    """Return a figure with `rows` x `columns` axes, and the axes as an array (rows, columns).
+
+    Args:
+        rows: number of rows.
+        columns: number of columns.
+        width: width of the whole figure in inches.
+        height: height of the whole figure in inches; 3.1 a row by default.
+        kwargs: passed to `matplotlib.pyplot.subplots` (`sharex`, `width_ratios`, ...).
+    """
+    use_style()
+    size = (width, 3.1 * rows if height is None else height)
+    return plt.subplots(rows, columns, figsize=size, squeeze=False, **kwargs)
+
+
+def axes_or_new(ax: Axes | None, size: tuple[float, float] = (7.0, 3.6)) -> Axes:
+    """Return `ax`, or the axes of a new figure in the style of the course."""
+    if ax is not None:
+        return ax
+    use_style()
+    return plt.subplots(figsize=size)[1]
+
+
+def figure_of(ax: Axes) -> Figure:
+    """Return the figure that `ax` lies in."""
+    return ax.get_figure(root=True)  # type: ignore[return-value]
+
+
+def label(ax: Axes, x: str, y: str, title: str | None = None) -> None:
+    """Label both axes (units in the label: `"time (s)"`) and set an optional title."""
+    ax.set_xlabel(x)
+    ax.set_ylabel(y)
+    if title:
+        ax.set_title(title)
+
+
+def png(fig: Figure, text: str = "") -> bytes:
+    """Return the figure as a PNG whose `Description` field holds `text`."""
+    stream = io.BytesIO()
+    fig.savefig(stream, format="png", dpi=_DPI, metadata={"Description": text, "Software": ""})
+    return stream.getvalue()
+
+
+def save(fig: Figure, path: str | Path, text: str = "") -> Path:
+    """Write the figure as a PNG file with its description inside, and close it."""
+    data = png(fig, text)
+    plt.close(fig)
+    return write_atomic(path, lambda file: file.write(data))
+
+
+class Described:
+    """A figure as bytes, with the line of text that says what it shows."""
+
+    def __init__(self, data: bytes, text: str, width: int) -> None:
+        self.data, self.text, self.width = data, text, width
+
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
+        encoded = base64.b64encode(self.data).decode()
+        words = html.escape(self.text, quote=True)
+        return {
+            "image/png": encoded,
+            "text/html": (
+                f'<figure style="margin:0.4em 0"><img alt="{words}" width="{self.width}" '
+                f'style="max-width:100%" src="data:image/png;base64,{encoded}">'
+                f'<figcaption style="font-size:0.95em;color:#555;max-width:52em">{words}'
+                "</figcaption></figure>"
+            ),
+            "text/plain": f"Figure: {self.text}",
+        }
+
+
+def describe(fig: Figure, text: str) -> None:
+    """Show a figure with one line under it that says what is to be seen, then close it.
+
+    The line is the image's alternative text too. Outside of IPython nothing is shown; the text is
+    kept as the figure's label either way.
+
+    Args:
+        fig: the figure.
+        text: one plain sentence or two, without a line break.
+
+    Raises:
+        ValueError: if the text is empty or longer than one line.
+    """
+    if not text.strip() or "\n" in text:
+        raise ValueError(f"wanted one line that describes the figure, got {text!r}")
+    fig.set_label(text)
+    width = round(fig.get_size_inches()[0] * _CSS_PIXELS_PER_INCH)
+    picture = Described(png(fig, text), text, width)
+    plt.close(fig)
+    try:
+        from IPython import get_ipython
+        from IPython.display import display
+    except ImportError:
+        return
+    if get_ipython() is not None:
+        display(picture)
