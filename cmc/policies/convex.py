@@ -1,0 +1,92 @@
+"""The closest peer: P and I terms that are gradients of strictly convex networks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from cmc.policies.fast_tanh import tanh
+from cmc.policies.stacked import check_seeds
+
+Array = NDArray[np.float64]
+
+
+class ConvexGradientNetwork(nn.Module):
+    """u = grad phi_P(z) + grad phi_I(integral of z), both phi strictly convex (arXiv 2305.17777).
+
+    Each term is the gradient of phi(z) = sum_h a_h log cosh(w_h . z + b_h) + (mu/2) |z|^2, a >= 0,
+
+        grad phi(z) = W diag(a) tanh(W' z + b) + mu z,
+
+    a strictly monotone map of all dimensions together: its Jacobian W diag(a tanh') W' + mu I is
+    symmetric and positive definite, where the positive network has one positive slope a dimension.
+
+    Args:
+        n: number of dimensions.
+        hidden: number of hidden units of each term.
+        seeds: one integer for each leading index, or None for no leading axis.
+        mu: strict convexity, > 0.
+        dtype: of the parameters.
+    """
+
+    def __init__(
+        self,
+        n: int,
+        *,
+        hidden: int = 32,
+        seeds: Sequence[int] | None = None,
+        mu: float = 1e-3,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        super().__init__()
+        if n < 1 or hidden < 1 or not mu > 0:
+            raise ValueError(f"wanted n, hidden >= 1 and mu > 0; got {n}, {hidden}, {mu}")
+        self.n, self.mu = n, mu
+        checked = check_seeds(seeds)
+        self.seeds = None if checked is None else len(checked)
+        parts: list[list[Array]] = [[], [], []]
+        for seed in checked or (0,):
+            rng = np.random.default_rng([seed, n, hidden])
+            parts[0].append(rng.standard_normal((2, n, hidden)) / np.sqrt(n))
+            parts[1].append(rng.uniform(0.0, 2.0, (2, 1, hidden)) / hidden)
+            parts[2].append(rng.uniform(-1.0, 1.0, (2, 1, hidden)))
+        W, a, b = (torch.as_tensor(np.concatenate(part), dtype=dtype) for part in parts)
+        self.W, self.a, self.b = nn.Parameter(W), nn.Parameter(a), nn.Parameter(b)
+
+    def _stacked(self, s: Tensor) -> Tensor:
+        """Move s ([seeds,] ..., n, 2) to (seeds * 2, batch, n): one row for each term."""
+        if s.ndim < 2 + (self.seeds is not None) or tuple(s.shape[-2:]) != (self.n, 2):
+            raise ValueError(f"wanted s of shape (..., {self.n}, 2); got {tuple(s.shape)}")
+        if self.seeds is not None and s.shape[0] != self.seeds:
+            raise ValueError(f"wanted a leading axis of {self.seeds} seeds; got {tuple(s.shape)}")
+        x = s.reshape(self.seeds or 1, -1, self.n, 2)
+        return x.permute(0, 3, 1, 2).reshape(-1, x.shape[1], self.n)
+
+    def forward(self, s: Tensor) -> Tensor:
+        """Evaluate both gradients: s (..., n, 2) to (..., n); with seeds (seeds, ..., n, 2)."""
+        x = self._stacked(s)
+        value = self.a.abs() * tanh(torch.baddbmm(self.b, x, self.W))
+        terms = torch.baddbmm(x, value, self.W.transpose(1, 2), beta=self.mu)
+        return terms.reshape(-1, 2, *terms.shape[1:]).sum(1).reshape(s.shape[:-1])
+
+    def jacobian(self, s: Tensor) -> Tensor:
+        """Full slopes d pi_i / d s_kj in closed form: s (..., n, 2) to (..., n, n, 2)."""
+        x = self._stacked(s)
+        value = tanh(torch.baddbmm(self.b, x, self.W))
+        gain = self.a.abs() * (1.0 - value * value)
+        slope = torch.einsum("gih,gbh,gkh->gbik", self.W, gain, self.W)
+        slope = slope + self.mu * torch.eye(self.n, dtype=slope.dtype)
+        slope = slope.reshape(-1, 2, *slope.shape[1:]).movedim(1, -1)
+        return slope.reshape(*s.shape[:-1], self.n, 2)
+
+    def slope_bounds(self) -> tuple[Array, Array]:
+        """Guaranteed interval of the diagonal slopes d pi_i / d s_ij, ([seeds,] n, 2) each."""
+        with torch.no_grad():
+            W, a = self.W.double(), self.a.abs().double()
+            high = (a * W * W).sum(-1).reshape(-1, 2, self.n).transpose(1, 2).numpy() + self.mu
+        high = high[0] if self.seeds is None else high
+        return np.full_like(high, self.mu), high

@@ -1,0 +1,174 @@
+"""One positive-weight tanh network per dimension, its slopes bounded on both sides."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor, nn
+
+from cmc.policies.stacked import StackedMLP, from_stack, to_stack
+
+Array = NDArray[np.float64]
+
+
+class NegativeWeightError(ValueError):
+    """A checkpoint holds negative weights where the sign condition needs positive ones."""
+
+
+class PositiveNetwork(nn.Module):
+    """pi_i(s_i) = m_i . s_i + W_l tanh(... tanh(W_1 s_i + b_1)) + b_l, with W >= 0, for each i.
+
+    With positive weights every slope is positive (`product`, `constraint_sign`). The linear bypass
+    m holds each slope above m, also where tanh saturates, and the cap scales the tanh network so
+    that each slope stays below M:  m_ij <= d pi_i / d s_ij <= M_ij  everywhere, by construction.
+    The paper's network is the case m = 0 without a cap.
+
+    Since tanh' <= 1, the product P_i = W_1 W_2 ... W_l bounds the slopes of a positive network, and
+    without biases it is the slope at 0. Input j is scaled by min(1, (M_ij - m_ij)/P_ij), and for a
+    joint cap the output by min(1, (limit - v . m_i)/(v . P_i)), so that v . slope <= limit.
+
+    Args:
+        n: number of dimensions.
+        hidden: sizes of the hidden layers.
+        seeds: one integer for each leading index, or None for no leading axis.
+        bias: without biases the policy is odd, pi(-s) = -pi(s), and zero at zero.
+        slope_min: m >= 0, broadcast to (n, 2): proportional and integral slope.
+        slope_max: M > m, broadcast to (n, 2), or None for no cap.
+        joint_cap: pair (v, limit), v >= 0 broadcast to (n, 2) and limit > 0 broadcast to (n,):
+            the cap v . slope <= limit, such as the sampled-data bound with v = (1, h/2).
+        dtype: of the parameters.
+
+    Raises:
+        ValueError: for bounds that are not finite, negative, or leave no room for the network.
+    """
+
+    slope_min: Tensor
+    room: Tensor | None
+    joint: Tensor | None
+
+    def __init__(
+        self,
+        n: int,
+        *,
+        hidden: Sequence[int] = (32, 32),
+        seeds: Sequence[int] | None = None,
+        bias: bool = True,
+        slope_min: ArrayLike = 0.0,
+        slope_max: ArrayLike | None = None,
+        joint_cap: tuple[ArrayLike, ArrayLike] | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        super().__init__()
+        self.n = n
+        self.mlp = StackedMLP(
+            2, 1, hidden, copies=n, seeds=seeds, bias=bias, start="positive", dtype=dtype
+        )
+        self.seeds = None if self.mlp.seeds is None else len(self.mlp.seeds)
+        low = _bound("slope_min", slope_min, (n, 2))
+        self._constant("slope_min", low, dtype)
+        self._constant("room", None, dtype)
+        self._constant("joint", None, dtype)
+        if slope_max is not None:
+            high = _bound("slope_max", slope_max, (n, 2))
+            if not (high > low).all():
+                raise ValueError(f"wanted slope_max above slope_min; got {high} and {low}")
+            self._constant("room", high - low, dtype)
+        if joint_cap is not None:
+            weight = _bound("joint cap weights", joint_cap[0], (n, 2))
+            limit = _bound("joint cap limit", joint_cap[1], (n,))
+            left = limit - (weight * low).sum(-1)
+            if not ((left > 0).all() and (weight.sum(-1) > 0).all()):
+                raise ValueError(
+                    f"the joint cap {limit} leaves no room above slope_min {low} "
+                    f"for the weights {weight}"
+                )
+            self._constant("joint", weight / left[:, None], dtype)  # v . P / left <= 1
+        self.register_state_dict_post_hook(_export_positive)
+        self.register_load_state_dict_pre_hook(_refuse_negative)
+
+    def _constant(self, name: str, value: Array | None, dtype: torch.dtype) -> None:
+        self.register_buffer(name, None if value is None else torch.as_tensor(value, dtype=dtype))
+
+    def positive_weights(self) -> list[Tensor]:
+        """Weights (stack, in, out) as used: absolute values, caps on the first and last."""
+        weights = [weight.abs() for weight in self.mlp.weights]
+        if self.room is None and self.joint is None:
+            return weights
+        product = _product(weights).reshape(-1, self.n, 2)
+        if self.room is not None:
+            scale = (self.room / product).clamp(max=1.0)
+            product = product * scale
+            weights[0] = weights[0] * scale.reshape(-1, 2, 1)
+        if self.joint is not None:
+            scale = (1.0 / (self.joint * product).sum(-1)).clamp(max=1.0)
+            weights[-1] = weights[-1] * scale.reshape(-1, 1, 1)
+        return weights
+
+    def forward(self, s: Tensor) -> Tensor:
+        """Evaluate the networks: s (..., n, 2) to (..., n); with seeds s is (seeds, ..., n, 2)."""
+        out = self.mlp.run(to_stack(s, self.seeds, self.n), self.positive_weights())
+        return from_stack(out[..., 0], s, self.seeds) + (self.slope_min * s).sum(-1)
+
+    def jacobian(self, s: Tensor) -> Tensor:
+        """Slopes d pi_i / d s_ij in closed form (`product`): s (..., n, 2) to (..., n, 2)."""
+        weights = self.positive_weights()
+        hidden = self.mlp.hidden_values(to_stack(s, self.seeds, self.n), weights)[:-1]
+        slope = weights[-1].transpose(1, 2)
+        for value, weight in zip(hidden[::-1], weights[-2::-1], strict=True):
+            slope = ((1.0 - value * value) * slope) @ weight.transpose(1, 2)  # M_j W_j of `product`
+        return from_stack(slope, s, self.seeds) + self.slope_min
+
+    def slope_bounds(self) -> tuple[Array, Array]:
+        """Guaranteed interval of each slope for the present weights, ([seeds,] n, 2) each.
+
+        The lower end of an uncapped, bypass-free network is 0 and is only approached.
+        """
+        with torch.no_grad():
+            low = self.slope_min.double().numpy()
+            high = _product([weight.double() for weight in self.positive_weights()])
+        shape = (self.n, 2) if self.seeds is None else (self.seeds, self.n, 2)
+        return np.broadcast_to(low, shape).copy(), high.reshape(shape).numpy() + low
+
+
+def _product(weights: Sequence[Tensor]) -> Tensor:
+    """W_1 W_2 ... W_l (stack, 2): the largest slope that tanh' <= 1 allows."""
+    product = weights[-1]
+    for weight in weights[-2::-1]:
+        product = weight @ product
+    return product[..., 0]
+
+
+def _bound(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Broadcast a bound to `shape`; it must be finite and not negative."""
+    array = np.asarray(value, dtype=np.float64)
+    try:
+        array = np.broadcast_to(array, shape).copy()
+    except ValueError as error:
+        raise ValueError(f"wanted {name} of shape {shape}; got {array.shape}") from error
+    if not np.isfinite(array).all() or (array < 0).any():
+        raise ValueError(f"wanted {name} finite and not negative; got {array}")
+    return array
+
+
+def _export_positive(
+    module: nn.Module, state: dict[str, Any], prefix: str, _metadata: Mapping[str, Any]
+) -> None:
+    """Write weights to a state dict as they are used, so that a file shows their sign."""
+    for name in state:
+        if name.startswith(f"{prefix}mlp.weights."):
+            state[name] = state[name].abs()
+
+
+def _refuse_negative(module: nn.Module, state: Mapping[str, Any], prefix: str, *_rest: Any) -> None:
+    """Refuse a state dict whose weights are not positive or not finite."""
+    for name, value in state.items():
+        if name.startswith(f"{prefix}mlp.weights.") and not bool((value >= 0).all()):
+            count = int((~(value >= 0)).sum())
+            raise NegativeWeightError(
+                f"wanted positive weights in {name!r}; {count} of {value.numel()} "
+                f"are negative or not numbers (smallest {float(value.min()):.3g})"
+            )
