@@ -210,7 +210,13 @@ def test_observation_layout():
     with pytest.raises(ValueError, match="finite"):
         as_numpy(policy)(observation.numpy())
     with pytest.raises(ValueError, match="layout"):
-        ModularPolicy(PositiveNetwork(2), layout={"s": slice(4)})
+        ModularPolicy(PositiveNetwork(2), layout={"R": slice(4)})
+    with pytest.raises(ValueError, match="no zero"):
+        ModularPolicy(PositiveNetwork(2), R=[1.0, 0.0])
+    constant = ModularPolicy(PositiveNetwork(2, dtype=f64), R=[2.0, -3.0])
+    plain = observation[1, :, :4]
+    R = torch.tensor([2.0, -3.0], dtype=f64)
+    torch.testing.assert_close(constant(plain), constant.command(plain.reshape(6, 2, 2), R))
     direct = DirectPolicy(JointNetwork(2, inputs=4, dtype=f64), part=slice(0, 4), u0=[1.0, 2.0])
     assert direct(signals(3, 12)).shape == (3, 2)
     with pytest.raises(ValueError, match="flat inputs"):

@@ -22,39 +22,43 @@ class ModularPolicy(nn.Module):
     Args:
         network: maps s (..., n, 2) to (..., n); has an attribute `n`.
         layout: where an observation holds "s" (2 n numbers, (n, 2) row by row), "R" (n, the
-            diagonal) and "T_a" (n n, row by row); without "T_a" it is the identity. Needed for
-            `forward`.
+            diagonal) and "T_a" (n n, row by row). By default the observation is "s". Without
+            "R" its diagonal is the argument `R`; without "T_a" it is the identity, as where the
+            environment applies it.
+        R: diagonal of R, broadcast to (n,), where the observation does not hold it.
         u0: centre of the command, broadcast to (n,).
         normalise: divide by |R_ii| in place of taking the sign alone, a_i = -pi_i / R_ii, so that
             the slopes of pi are loop gains in 1/s whatever the plant: z_i' = Lambda_i z_i - pi_i.
     """
 
     u0: Tensor
+    R: Tensor
 
     def __init__(
         self,
         network: nn.Module,
         *,
         layout: Mapping[str, slice] | None = None,
+        R: ArrayLike = 1.0,
         u0: ArrayLike = 0.0,
         normalise: bool = False,
     ) -> None:
         super().__init__()
-        if layout is not None and not {"s", "R"} <= set(layout):
-            raise ValueError(f"wanted a layout with 's' and 'R'; got {sorted(layout)}")
         self.network, self.normalise = network, normalise
         self.n = int(network.n)  # type: ignore[arg-type]
-        self.layout = None if layout is None else dict(layout)
+        self.layout = {"s": slice(0, 2 * self.n)} if layout is None else dict(layout)
+        if "s" not in self.layout or not set(self.layout) <= {"s", "R", "T_a"}:
+            raise ValueError(f"wanted a layout of 's', 'R' and 'T_a'; got {sorted(self.layout)}")
         dtype = next(network.parameters()).dtype
-        centre = np.broadcast_to(np.asarray(u0, dtype=np.float64), (self.n,))
-        self.register_buffer("u0", torch.as_tensor(centre.copy(), dtype=dtype))
+        self.register_buffer("u0", _vector("u0", u0, self.n, dtype))
+        self.register_buffer("R", _vector("R", R, self.n, dtype))
+        if not bool((self.R != 0).all()):
+            raise ValueError(f"wanted no zero on the diagonal of R; got {R}")
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the command (..., n) for an observation (..., d) laid out as `layout` says."""
-        if self.layout is None:
-            raise ValueError("this policy has no observation layout; use `command`")
         s = observation[..., self.layout["s"]].unflatten(-1, (self.n, 2))
-        R = observation[..., self.layout["R"]]
+        R = observation[..., self.layout["R"]] if "R" in self.layout else self.R
         if "T_a" not in self.layout:
             return self.command(s, R)
         T_a = observation[..., self.layout["T_a"]].unflatten(-1, (self.n, self.n))
@@ -93,12 +97,18 @@ class DirectPolicy(nn.Module):
         self.network, self.part = network, part
         self.n = int(network.n)  # type: ignore[arg-type]
         dtype = next(network.parameters()).dtype
-        centre = np.broadcast_to(np.asarray(u0, dtype=np.float64), (self.n,))
-        self.register_buffer("u0", torch.as_tensor(centre.copy(), dtype=dtype))
+        self.register_buffer("u0", _vector("u0", u0, self.n, dtype))
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the command (..., n) for an observation (..., d)."""
         return self.u0 + self.network(observation[..., self.part])
+
+
+def _vector(name: str, value: ArrayLike, n: int, dtype: torch.dtype) -> Tensor:
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape not in ((), (1,), (n,)) or not np.isfinite(array).all():
+        raise ValueError(f"wanted {name} finite, a number or ({n},); got {value}")
+    return torch.as_tensor(np.broadcast_to(array, (n,)).copy(), dtype=dtype)
 
 
 def as_numpy(policy: nn.Module) -> Any:
