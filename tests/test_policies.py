@@ -195,6 +195,16 @@ def test_normalised_command_makes_the_slope_a_loop_gain():
     torch.testing.assert_close(R * policy.command(s, R), -policy.network(s))
 
 
+def test_without_the_integral():
+    policy = ModularPolicy(PositiveNetwork(2, dtype=f64), integral=False)
+    s, other = signals(30, 2, 2), signals(30, 2, 2, seed=9)
+    other[..., 0] = s[..., 0]
+    torch.testing.assert_close(policy(other.flatten(1)), policy(s.flatten(1)))
+    assert (policy.jacobian(s)[..., 1] == 0).all()
+    assert (policy.jacobian(s)[..., 0] > 0).all()
+    assert (policy.slope_bounds()[1][..., 1] == 0).all()
+
+
 def test_observation_layout():
     layout = {"s": slice(1, 5), "R": slice(5, 7), "T_a": slice(7, 11)}
     policy = ModularPolicy(PositiveNetwork(2, seeds=[0, 1], dtype=f64), layout=layout, u0=1.0)

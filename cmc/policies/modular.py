@@ -29,6 +29,7 @@ class ModularPolicy(nn.Module):
         u0: centre of the command, broadcast to (n,).
         normalise: divide by |R_ii| in place of taking the sign alone, a_i = -pi_i / R_ii, so that
             the slopes of pi are loop gains in 1/s whatever the plant: z_i' = Lambda_i z_i - pi_i.
+        integral: False feeds zero in place of the integral, the proportional-only variant.
     """
 
     u0: Tensor
@@ -42,9 +43,10 @@ class ModularPolicy(nn.Module):
         R: ArrayLike = 1.0,
         u0: ArrayLike = 0.0,
         normalise: bool = False,
+        integral: bool = True,
     ) -> None:
         super().__init__()
-        self.network, self.normalise = network, normalise
+        self.network, self.normalise, self.integral = network, normalise, integral
         self.n = int(network.n)  # type: ignore[arg-type]
         self.layout = {"s": slice(0, 2 * self.n)} if layout is None else dict(layout)
         if "s" not in self.layout or not set(self.layout) <= {"s", "R", "T_a"}:
@@ -53,7 +55,7 @@ class ModularPolicy(nn.Module):
         self.register_buffer("u0", _vector("u0", u0, self.n, dtype))
         self.register_buffer("R", _vector("R", R, self.n, dtype))
         if not bool((self.R != 0).all()):
-            raise ValueError(f"wanted no zero on the diagonal of R; got {R}")
+            raise ValueError(f"wanted no zero on the diagonal of R; got {R!r}")
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the command (..., n) for an observation (..., d) laid out as `layout` says."""
@@ -67,18 +69,25 @@ class ModularPolicy(nn.Module):
     def command(self, s: Tensor, R: Tensor, T_a: Tensor | None = None) -> Tensor:
         """Return u = u0 + T_a a from s (..., n, 2), diag(R) (..., n) and T_a (..., n, n)."""
         factor = 1.0 / R if self.normalise else torch.sign(R)
-        a = -factor * self.network(s)  # constraint_sign
+        a = -factor * self.network(self._visible(s))  # constraint_sign
         if T_a is not None:
             a = (T_a * a.unsqueeze(-2)).sum(-1)
         return self.u0 + a
 
     def jacobian(self, s: Tensor) -> Tensor:
         """Slopes of the network, before the sign rule: s (..., n, 2) to (..., n, 2)."""
-        return self.network.jacobian(s)  # type: ignore[operator]
+        slope = self.network.jacobian(self._visible(s))  # type: ignore[operator]
+        return self._visible(slope)
 
     def slope_bounds(self) -> tuple[Array, Array]:
         """Guaranteed interval of the slopes' magnitude, ([seeds,] n, 2) each."""
-        return self.network.slope_bounds()  # type: ignore[operator]
+        low, high = self.network.slope_bounds()  # type: ignore[operator]
+        if not self.integral:
+            low[..., 1], high[..., 1] = 0.0, 0.0
+        return low, high
+
+    def _visible(self, s: Tensor) -> Tensor:
+        return s if self.integral else s * s.new_tensor([1.0, 0.0])
 
 
 class DirectPolicy(nn.Module):
@@ -107,7 +116,7 @@ class DirectPolicy(nn.Module):
 def _vector(name: str, value: ArrayLike, n: int, dtype: torch.dtype) -> Tensor:
     array = np.asarray(value, dtype=np.float64)
     if array.shape not in ((), (1,), (n,)) or not np.isfinite(array).all():
-        raise ValueError(f"wanted {name} finite, a number or ({n},); got {value}")
+        raise ValueError(f"wanted {name} finite, a number or ({n},); got {value!r}")
     return torch.as_tensor(np.broadcast_to(array, (n,)).copy(), dtype=dtype)
 
 
