@@ -1,0 +1,14 @@
+"""3D playback: record a MuJoCo motion and get one HTML file that plays anywhere, offline.
+
+recording = record(model, qpos, times, trails=["tip"])
+recording.save("maze.html")           # a file to open, mail or publish
+recording.show("playback/maze.html")  # in a notebook, with a slider that needs no kernel
+with recording.serve() as live:       # meshcat live on the loopback interface
+    live.update(data)
+"""
+
+from cmc.view.playback.cameras import Camera, around
+from cmc.view.playback.overlays import Arrow, Marker, Trail
+from cmc.view.playback.recorder import Recording, record
+
+__all__ = ["Arrow", "Camera", "Marker", "Recording", "Trail", "around", "record"]
