@@ -1,0 +1,293 @@
+"""Proximal policy optimisation of several seeds at once, in one batch of networks.
+
+The algorithm is the usual one (Schulman et al. 2017): clipped surrogate, generalised advantage
+estimation, time limits bootstrapped. Everything carries a leading axis of seeds S, and no operation
+mixes seeds: advantages are normalised, gradients are clipped and minibatches are drawn a seed at a
+time, so a seed learns the same alone and in a batch.
+
+PPO and C-PPO differ in the policy that is passed in, and in nothing else.
+
+An update starts by resetting the environment with integers derived from (seed, update). The whole
+state of a training is therefore its weights, Adam's moments and the number of updates done: a
+training that is killed and resumed ends with the weights of one that was not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import VectorEnv
+from torch import Tensor, nn
+
+from cmc.learning import training_state
+from cmc.learning.rollout import Rollout, collect
+from cmc.policies import StackedMLP
+
+Callback = Callable[[dict[str, Any]], object]
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Hyperparameters. The paper gives none: all are our choice."""
+
+    steps: int = 50
+    """Environment steps of each trajectory in an update; a multiple of the episode length."""
+    epochs: int = 4
+    """Passes over the data of an update."""
+    minibatches: int = 4
+    """Minibatches a pass."""
+    learning_rate: float = 2e-3
+    """Adam's step size."""
+    gamma: float = 0.99
+    """Discount factor."""
+    gae_lambda: float = 0.95
+    """Lambda of the generalised advantage estimate."""
+    clip: float = 0.2
+    """Half-width of the interval to which the probability ratio is clipped."""
+    value_weight: float = 0.5
+    """Weight of the critic's squared error in the loss."""
+    max_norm: float = 0.5
+    """Largest norm of a seed's gradient."""
+    log_std_start: float = -1.0
+    """First logarithm of the exploration noise's standard deviation."""
+    log_std_floor: float = -4.0
+    """Smallest logarithm of the standard deviation."""
+    critic_hidden: tuple[int, ...] = (64, 64)
+    """Hidden layers of the critic."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "epochs", "minibatches"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: wanted at least 1, got {getattr(self, name)}")
+        for name in ("learning_rate", "clip", "max_norm"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name}: wanted a positive number, got {getattr(self, name)}")
+        for name in ("gamma", "gae_lambda"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name}: wanted a number in [0, 1], got {getattr(self, name)}")
+
+
+class PPO:
+    """Train `policy` on `env` with several seeds at once.
+
+    Args:
+        env: a vector environment of S E trajectories, seed by seed; `reset` takes one integer a
+            seed (a single integer if S = 1). A critic sees `info["privileged"]` where there is one
+            and the observation otherwise.
+        policy: module from observations (S, batch, d) to mean commands (S, batch, n), built with
+            the same seeds.
+        seeds: one non-negative integer for each seed.
+        config: hyperparameters.
+
+    Raises:
+        ValueError: if there is no seed or the trajectories cannot be shared out equally.
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv[Any, Any, Any],
+        policy: nn.Module,
+        seeds: Sequence[int],
+        config: PPOConfig | None = None,
+    ) -> None:
+        self.env, self.policy, self.config = env, policy, config or PPOConfig()
+        self.seeds = tuple(int(seed) for seed in seeds)
+        if not self.seeds or env.num_envs % len(self.seeds):
+            raise ValueError(
+                f"wanted at least one seed, a number that divides {env.num_envs} trajectories; "
+                f"got {len(self.seeds)}"
+            )
+        first, info = env.reset(seed=self._environment_seeds(0))
+        inputs = info.get("privileged", first).shape[-1]
+        self.critic = StackedMLP(inputs, 1, self.config.critic_hidden, seeds=self.seeds, last=0.1)
+        n = env.single_action_space.shape[0]  # type: ignore[index]
+        self.log_std = nn.Parameter(torch.full((len(self.seeds), 1, n), self.config.log_std_start))
+        named = [*policy.named_parameters("policy"), *self.critic.named_parameters("critic")]
+        self.parameters = {**dict(named), "log_std": self.log_std}
+        self.optimiser = torch.optim.Adam(
+            self.parameters.values(), lr=self.config.learning_rate, eps=1e-5, fused=True
+        )
+        self.updates = 0
+        """Updates done."""
+
+    @property
+    def episodes(self) -> int:
+        """Trajectories of `config.steps` steps that each seed has seen."""
+        return self.updates * (self.env.num_envs // len(self.seeds))
+
+    def update(self) -> dict[str, Any]:
+        """Collect one batch of trajectories, learn from it, and report.
+
+        Returns:
+            `update`, `episodes` and `steps` (of each seed, so far), and by seed (S,) arrays:
+            `episode_return` (sum of rewards over `config.steps` steps, mean over trajectories),
+            `value_loss`, `clip_fraction`, `std` (S, n).
+        """
+        c = self.config
+        generators = [np.random.default_rng([seed, self.updates]) for seed in self.seeds]
+        rollout = collect(
+            self.env,
+            self.policy,
+            self.log_std.detach(),
+            self._environment_seeds(self.updates),
+            generators,
+            c.steps,
+        )
+        data = self._learning_data(rollout)
+        count = data["advantage"].shape[1]
+        report: dict[str, Tensor] = {}
+        for _ in range(c.epochs):
+            order = np.stack([generator.permutation(count) for generator in generators])
+            for part in np.array_split(order, c.minibatches, axis=1):
+                report = self._minibatch(data, torch.as_tensor(part))
+        self.updates += 1
+        steps = c.steps * self.episodes
+        return {
+            "update": self.updates,
+            "episodes": self.episodes,
+            "steps": steps,
+            "episode_return": rollout.reward.sum(1).mean(1),
+            "std": self.log_std.detach().exp()[:, 0].numpy(),
+            **{name: value.numpy() for name, value in report.items()},
+        }
+
+    def train(
+        self,
+        updates: int,
+        callback: Callback | None = None,
+        *,
+        checkpoint: str | Path | None = None,
+        every: int = 25,
+        record: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Learn until `updates` updates are done; a given checkpoint is resumed and kept current.
+
+        An interrupt (Ctrl-C, a stopped notebook cell) between or within updates returns to the last
+        whole update, writes the checkpoint and is raised again; calling `train` goes on from there.
+
+        Args:
+            updates: updates in all, those already done included.
+            callback: called with the report of each update.
+            checkpoint: file of the training's state; resumed from if it exists.
+            every: updates between two checkpoints.
+            record: JSON record for the checkpoint: at least `study` and `method`.
+        """
+        if checkpoint is not None and Path(checkpoint).is_file():
+            self.restore(checkpoint, record)
+        while self.updates < updates:
+            before = training_state.take(self)
+            try:
+                report = self.update()
+                if callback is not None:
+                    callback({**report, "total_updates": updates})
+            except KeyboardInterrupt:
+                if self.updates == int(before["updates"]):
+                    training_state.put(self, before)
+                if checkpoint is not None:
+                    self.save(checkpoint, record)
+                raise
+            if checkpoint is not None and (self.updates % every == 0 or self.updates == updates):
+                self.save(checkpoint, record)
+
+    def save(self, path: str | Path, record: Mapping[str, Any] | None = None) -> None:
+        """Write the whole state of the training (safetensors, atomic)."""
+        training_state.save(self, path, {"ppo": asdict(self.config), **(record or {})})
+
+    def restore(self, path: str | Path, record: Mapping[str, Any] | None = None) -> None:
+        """Go on from a file written by `save`.
+
+        Raises:
+            CheckpointError: if it is no such file, or of other seeds, sizes or hyperparameters.
+        """
+        training_state.restore(self, path, {"ppo": asdict(self.config), **(record or {})})
+
+    def _environment_seeds(self, update: int) -> Any:
+        """One integer for each seed, and a single one where there is a single seed."""
+        drawn = [
+            int(np.random.SeedSequence([seed, update, 1]).generate_state(1)[0])
+            for seed in self.seeds
+        ]
+        return drawn if len(drawn) > 1 else drawn[0]
+
+    @torch.no_grad()
+    def _learning_data(self, rollout: Rollout) -> dict[str, Tensor]:
+        """Advantages, value targets and log-probabilities, flat in time: (S, T E, ...)."""
+        c = self.config
+        shape = rollout.reward.shape
+        value = self.critic(rollout.privileged.flatten(1, 2)).reshape(shape).numpy()
+        following = self.critic(rollout.following.flatten(1, 2)).reshape(shape).numpy()
+        advantage = generalised_advantage(rollout, value, following, c.gamma, c.gae_lambda)
+        noise = rollout.noise
+        log_probability = -(0.5 * noise * noise + self.log_std.unsqueeze(1)).sum(-1)
+        data = {
+            "observation": rollout.observation,
+            "privileged": rollout.privileged,
+            "action": rollout.action,
+            "log_probability": log_probability,
+            "advantage": torch.as_tensor(advantage, dtype=torch.float32),
+            "target": torch.as_tensor(advantage + value, dtype=torch.float32),
+        }
+        return {name: part.flatten(1, 2) for name, part in data.items()}
+
+    def _minibatch(self, data: Mapping[str, Tensor], index: Tensor) -> dict[str, Tensor]:
+        """One step of Adam on the minibatch `index` (S, m); losses are sums over seeds."""
+        c = self.config
+        row = torch.arange(len(self.seeds)).unsqueeze(1)
+        batch = {name: part[row, index] for name, part in data.items()}
+        advantage = batch["advantage"]
+        spread, centre = torch.std_mean(advantage, dim=1, keepdim=True)
+        advantage = (advantage - centre) / (spread + 1e-8)
+
+        mean = self.policy(batch["observation"])
+        noise = (batch["action"] - mean) * torch.exp(-self.log_std)
+        log_probability = -(0.5 * noise * noise + self.log_std).sum(-1)
+        ratio = torch.exp(log_probability - batch["log_probability"])
+        clipped = ratio.clamp(1.0 - c.clip, 1.0 + c.clip)
+        policy_loss = -torch.minimum(ratio * advantage, clipped * advantage).mean(1)
+        value_loss = (self.critic(batch["privileged"])[..., 0] - batch["target"]).square().mean(1)
+
+        self.optimiser.zero_grad()
+        (policy_loss + c.value_weight * value_loss).sum().backward()
+        clip_gradients([p.grad for p in self.parameters.values()], len(self.seeds), c.max_norm)
+        self.optimiser.step()
+        with torch.no_grad():
+            self.log_std.clamp_(min=c.log_std_floor)
+            outside = ((ratio - 1.0).abs() > c.clip).float().mean(1)
+        return {"value_loss": value_loss.detach(), "clip_fraction": outside}
+
+
+def generalised_advantage(
+    rollout: Rollout, value: np.ndarray, following: np.ndarray, gamma: float, lam: float
+) -> np.ndarray:
+    """Generalised advantage estimate A_t = delta_t + gamma lambda A_t+1 (Schulman et al. 2016).
+
+    delta_t = r_t + gamma V(next) - V(now), where V(next) is the critic at the state that was
+    reached, also where a time limit cut the episode, and 0 only where the task ended.
+
+    Args:
+        rollout: reward, terminated and done, (S, T, E) each.
+        value: critic at the states, (S, T, E).
+        following: critic at the states reached, before any restart, (S, T, E).
+        gamma: discount factor.
+        lam: lambda.
+    """
+    delta = rollout.reward + gamma * following * ~rollout.terminated - value
+    carry = gamma * lam * ~rollout.done
+    advantage = delta.copy()
+    for t in range(delta.shape[1] - 2, -1, -1):
+        advantage[:, t] += carry[:, t] * advantage[:, t + 1]
+    return advantage
+
+
+def clip_gradients(gradients: Sequence[Tensor | None], seeds: int, max_norm: float) -> None:
+    """Scale each seed's gradient, over all parameters, to a norm of at most `max_norm`."""
+    rows = [gradient.view(seeds, -1) for gradient in gradients if gradient is not None]
+    squares = torch.stack([torch.linalg.vector_norm(row, dim=1) for row in rows])
+    scale = (max_norm / (torch.linalg.vector_norm(squares, dim=0) + 1e-6)).clamp(max=1.0)
+    for row in rows:
+        row.mul_(scale.unsqueeze(1))

@@ -1,0 +1,216 @@
+"""TD3 for several seeds at once: twin critics, a delayed actor, clipped dQ/da.
+
+Source: Fujimoto, van Hoof, Meger, "Addressing function approximation error in actor-critic
+methods", ICML 2018, with the options that the paper's tables name (`tab:my_label`, `tab:para`).
+The networks of all seeds are one stack, the learners stay independent: Adam works elementwise, and
+gradients are clipped seed by seed.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from cmc.learning.replay import Batch
+from cmc.policies import StackedMLP
+
+
+@dataclass(frozen=True)
+class TD3Config:
+    """Settings of one learner; defaults are the paper's `tab:para` unless marked.
+
+    Attributes:
+        actor_rate: Adam step of the actor (the table calls it the target learning rate).
+        critic_rate: Adam step of the critics.
+        discount: per transition of this learner.
+        target_rate: part of the way that targets move at each target update.
+        target_period: critic updates between target updates.
+        actor_period: critic updates between actor updates (2, TD3's default).
+        action_gradient_clip: bound on each entry of dQ/da, or None.
+        gradient_clip: bound on the norm of each parameter's gradient, seed by seed, or None.
+        target_noise: standard deviation of the noise on target actions (0.2, TD3's default).
+        target_noise_clip: bound on that noise (0.5, TD3's default).
+        critic_hidden: hidden sizes of the tanh critics (our choice; the paper's are 400, 300).
+        batch: transitions of each seed in one update.
+        critic_head_start: critic updates before the actor first moves (our choice: 0).
+    """
+
+    actor_rate: float = 1e-4
+    critic_rate: float = 1e-3
+    discount: float = 0.99
+    target_rate: float = 0.005
+    target_period: int = 50
+    actor_period: int = 2
+    action_gradient_clip: float | None = None
+    gradient_clip: float | None = None
+    target_noise: float = 0.2
+    target_noise_clip: float = 0.5
+    critic_hidden: tuple[int, ...] = (128, 128)
+    batch: int = 128
+    critic_head_start: int = 0
+
+    def __post_init__(self) -> None:
+        positive = (self.actor_rate, self.critic_rate, self.target_period, self.actor_period)
+        if min(*positive, self.batch) <= 0:
+            raise ValueError(f"rates, periods and the batch must be positive: {self}")
+        if not (0 <= self.discount <= 1 and 0 < self.target_rate <= 1):
+            raise ValueError(f"wanted 0 <= discount <= 1 and 0 < target_rate <= 1: {self}")
+
+
+class TD3:
+    """One actor and twin critics for each seed.
+
+    Args:
+        actor: maps observations (seeds, batch, size) to actions in [-1, 1] (seeds, batch, action).
+        seeds: one integer for each seed.
+        observation: size of what the critics see.
+        action: size of an action.
+        config: settings.
+        stream: separates learners that share their seeds (two levels, say).
+    """
+
+    def __init__(
+        self,
+        actor: nn.Module,
+        seeds: Sequence[int],
+        observation: int,
+        action: int,
+        config: TD3Config,
+        stream: int = 0,
+    ) -> None:
+        self.config, self.seeds = config, tuple(seeds)
+        self.actor = actor
+        own = [seed * 1009 + stream for seed in seeds]
+        self.critics = StackedMLP(
+            observation + action, 1, config.critic_hidden, copies=2, seeds=own, start="signed"
+        )
+        self.target_actor = copy.deepcopy(actor).requires_grad_(False)
+        self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
+        self.actor_adam = torch.optim.Adam(actor.parameters(), config.actor_rate, foreach=True)
+        self.critic_adam = torch.optim.Adam(
+            self.critics.parameters(), config.critic_rate, foreach=True
+        )
+        self.updates = 0
+        self._generators = [np.random.default_rng([seed, stream, 13]) for seed in seeds]
+
+    def values(self, critics: StackedMLP, observation: Tensor, action: Tensor) -> Tensor:
+        """Both critics' values, (seeds, 2, batch)."""
+        x = torch.cat([observation, action], dim=-1).repeat_interleave(2, dim=0)
+        return critics(x)[..., 0].reshape(len(self.seeds), 2, -1)
+
+    def update(self, batch: Batch) -> dict[str, np.ndarray]:
+        """One critic update, and now and then one of the actor and the targets.
+
+        Returns:
+            The critics' mean squared error of each seed, (seeds,).
+        """
+        error = self._update_critics(batch)
+        self.updates += 1
+        config = self.config
+        ready = self.updates > config.critic_head_start
+        if ready and self.updates % config.actor_period == 0:
+            self._update_actor(batch)
+        if self.updates % config.target_period == 0:
+            _move(self.target_actor, self.actor, config.target_rate)
+            _move(self.target_critics, self.critics, config.target_rate)
+        return {"critic_error": error}
+
+    def _update_critics(self, batch: Batch) -> np.ndarray:
+        target = batch.reward
+        if bool(batch.continues.any()):  # returns that end here need no next value
+            with torch.no_grad():
+                following = self.target_actor(batch.next_observation)
+                following = (following + self._smoothing(following)).clamp(-1.0, 1.0)
+                value = self.values(self.target_critics, batch.next_observation, following)
+                target = target + self.config.discount * batch.continues * value.amin(1)
+        value = self.values(self.critics, batch.observation, batch.action)
+        error = (value - target[:, None]).square().mean(-1).sum(-1)
+        self.critic_adam.zero_grad()
+        error.sum().backward()
+        self._clip(self.critics)
+        self.critic_adam.step()
+        return error.detach().numpy().copy()
+
+    def _update_actor(self, batch: Batch) -> None:
+        action = self.actor(batch.observation)
+        free = action.detach().requires_grad_()
+        value = self.values(self.critics, batch.observation, free)[:, 0]
+        (slope,) = torch.autograd.grad(value.sum(), free)  # dQ/da
+        clip = self.config.action_gradient_clip
+        if clip is not None:
+            slope = slope.clamp(-clip, clip)
+        self.actor_adam.zero_grad()
+        (-(slope * action).sum() / action.shape[1]).backward()
+        self._clip(self.actor)
+        self.actor_adam.step()
+
+    def _smoothing(self, like: Tensor) -> Tensor:
+        noise = [generator.standard_normal(like.shape[1:]) for generator in self._generators]
+        scaled = self.config.target_noise * torch.from_numpy(np.stack(noise)).to(like.dtype)
+        return scaled.clamp(-self.config.target_noise_clip, self.config.target_noise_clip)
+
+    def _clip(self, module: nn.Module) -> None:
+        """Shorten each parameter's gradient to the bound, seed by seed."""
+        bound = self.config.gradient_clip
+        if bound is None:
+            return
+        for parameter in module.parameters():
+            if parameter.grad is not None:
+                by_seed = parameter.grad.view(len(self.seeds), -1)
+                norm = by_seed.norm(dim=1, keepdim=True)
+                by_seed.mul_((bound / norm.clamp(min=1e-12)).clamp(max=1.0))
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """All that is needed to continue: weights, targets, Adam, counter, generators."""
+        modules = (self.actor, self.critics, self.target_actor, self.target_critics)
+        arrays = {
+            f"{name}.{key}": value.numpy().copy()
+            for name, module in zip(_MODULES, modules, strict=True)
+            for key, value in module.state_dict().items()
+        }
+        for name, adam in (("actor_adam", self.actor_adam), ("critic_adam", self.critic_adam)):
+            for index, slots in adam.state_dict()["state"].items():
+                arrays |= {f"{name}.{index}.{k}": v.numpy().copy() for k, v in slots.items()}
+        generators = [generator.bit_generator.state for generator in self._generators]
+        return arrays, {"updates": self.updates, "generators": generators}
+
+    def restore(self, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:
+        """Continue from `state`."""
+        modules = (self.actor, self.critics, self.target_actor, self.target_critics)
+        for name, module in zip(_MODULES, modules, strict=True):
+            module.load_state_dict(_part(arrays, name))
+        for name, adam in (("actor_adam", self.actor_adam), ("critic_adam", self.critic_adam)):
+            slots: dict[int, dict[str, Tensor]] = {}
+            for key, value in _part(arrays, name).items():
+                index, slot = key.split(".")
+                slots.setdefault(int(index), {})[slot] = value
+            adam.load_state_dict({**adam.state_dict(), "state": slots})
+        self.updates = int(record["updates"])
+        for generator, state in zip(self._generators, record["generators"], strict=True):
+            generator.bit_generator.state = state
+
+
+_MODULES = ("actor", "critics", "target_actor", "target_critics")
+
+
+def _part(arrays: dict[str, np.ndarray], name: str) -> dict[str, Tensor]:
+    """Arrays whose name starts with `name.`, as tensors, without that prefix."""
+    start = f"{name}."
+    return {
+        key.removeprefix(start): torch.from_numpy(np.array(value))
+        for key, value in arrays.items()
+        if key.startswith(start)
+    }
+
+
+@torch.no_grad()
+def _move(target: nn.Module, source: nn.Module, rate: float) -> None:
+    """Move the target: target <- (1 - rate) target + rate source."""
+    pairs = list(zip(target.parameters(), source.parameters(), strict=True))
+    torch._foreach_lerp_([t for t, _ in pairs], [s.detach() for _, s in pairs], rate)
