@@ -1,0 +1,516 @@
+// Draws the frames of cmc.view.picture on HTML canvases, one per panel. Loads nothing.
+//
+// A frame is {serial, panels, text, time, data}: `panels` is a layout whose arrays are named by
+// {at, shape} in `data`, a block of float32. Only the newest frame is ever drawn.
+
+const FONT = "13px 'DejaVu Sans', 'Segoe UI', 'Helvetica Neue', Arial, sans-serif";
+const SMALL = FONT.replace("13px", "12px");
+const TINY = FONT.replace("13px", "10px");
+const INK = "#333333";
+const LETTERS = {
+  alpha: "α", beta: "β", gamma: "γ", delta: "δ", lambda: "λ", Lambda: "Λ", mu: "μ", omega: "ω",
+  Omega: "Ω", phi: "φ", pi: "π", rho: "ρ", sigma: "σ", tau: "τ", theta: "θ", Theta: "Θ",
+  partial: "∂", int: "∫", cdot: "·", le: "≤", ge: "≥", times: "×", ",": " ",
+};
+
+// ---- text: `$y_1$`, `$\Lambda_{11}$` as runs of plain, raised and lowered pieces
+
+function runs(label) {
+  const out = [];
+  String(label).split("$").forEach((part, k) => {
+    if (k % 2 === 0) {
+      if (part) out.push({ text: part, shift: 0, italic: false });
+      return;
+    }
+    const dotted = part.replace(/\\dot\s*\{?([A-Za-z])\}?/g, "$1\u0307");
+    const tokens = dotted.match(/\\[A-Za-z]+|\\,|[_^]\{[^}]*\}|[_^]\S|[^\\_^]\u0307?/g) || [];
+    for (const token of tokens) {
+      const shift = token[0] === "_" ? 1 : token[0] === "^" ? -1 : 0;
+      const body = shift ? token.slice(1).replace(/[{}]/g, "") : token;
+      const text = body.replace(/\\([A-Za-z]+|,)/g, (_, name) => LETTERS[name] ?? name);
+      out.push({ text, shift, italic: !shift && /^[A-Za-z]\u0307?$/.test(text) });
+    }
+  });
+  return out;
+}
+
+function plain(label) {
+  return runs(label).map((run) => run.text).join("");
+}
+
+function setRun(ctx, run, base) {
+  ctx.font = (run.italic ? "italic " : "") + (run.shift ? TINY : base);
+}
+
+function textWidth(ctx, label, base = FONT) {
+  let width = 0;
+  for (const run of runs(label)) {
+    setRun(ctx, run, base);
+    width += ctx.measureText(run.text).width;
+  }
+  return width;
+}
+
+function drawText(ctx, label, x, y, align = "left", base = FONT) {
+  const width = textWidth(ctx, label, base);
+  let at = align === "center" ? x - width / 2 : align === "right" ? x - width : x;
+  ctx.textAlign = "left";
+  for (const run of runs(label)) {
+    setRun(ctx, run, base);
+    ctx.fillText(run.text, at, y + 4 * run.shift);
+    at += ctx.measureText(run.text).width;
+  }
+}
+
+// ---- axes
+
+function ticks(low, high, count) {
+  const raw = (high - low) / Math.max(count, 1);
+  const power = 10 ** Math.floor(Math.log10(raw));
+  const step = [1, 2, 5, 10].find((m) => m * power >= raw) * power;
+  const out = [];
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) out.push(k * step);
+  return out;
+}
+
+function logTicks(low, high) {
+  const first = Math.ceil(low - 1e-9), last = Math.floor(high + 1e-9);
+  if (last <= first) return ticks(low, high, 3);
+  const stride = Math.max(1, Math.ceil((last - first) / 5));
+  const out = [];
+  for (let k = first; k <= last; k += stride) out.push(k);
+  return out;
+}
+
+function tickText(value, log) {
+  if (log) return Number.isInteger(value) ? `$10^{${value}}$` : (10 ** value).toPrecision(2);
+  if (value === 0 || Math.abs(value) < 1e-12) return "0";
+  const size = Math.abs(value);
+  if (size >= 1e5 || size < 1e-3) return value.toExponential(1).replace("e+", "e").replace("-", "−");
+  return String(+value.toPrecision(6)).replace("-", "−");
+}
+
+class Axes {
+  constructor(panel, width, height) {
+    const top = panel.title ? 32 : 14;
+    this.box = { left: 62, top, right: width - 14, bottom: height - 44 };
+    [this.x0, this.x1] = panel.xlim;
+    [this.y0, this.y1] = panel.log ? panel.ylim.map(Math.log10) : panel.ylim;
+    this.log = panel.log;
+    if (panel.equal) this.makeEqual();
+    this.sx = (this.box.right - this.box.left) / (this.x1 - this.x0);
+    this.sy = (this.box.bottom - this.box.top) / (this.y1 - this.y0);
+  }
+
+  makeEqual() {
+    const w = this.box.right - this.box.left, h = this.box.bottom - this.box.top;
+    const unit = Math.max((this.x1 - this.x0) / w, (this.y1 - this.y0) / h);
+    const cx = (this.x0 + this.x1) / 2, cy = (this.y0 + this.y1) / 2;
+    [this.x0, this.x1] = [cx - (unit * w) / 2, cx + (unit * w) / 2];
+    [this.y0, this.y1] = [cy - (unit * h) / 2, cy + (unit * h) / 2];
+  }
+
+  x(value) {
+    return this.box.left + (value - this.x0) * this.sx;
+  }
+
+  y(value) {
+    return this.box.bottom - ((this.log ? Math.log10(value) : value) - this.y0) * this.sy;
+  }
+
+  draw(ctx, panel) {
+    const { left, top, right, bottom } = this.box;
+    const xs = ticks(this.x0, this.x1, (right - left) / 70);
+    const ys = this.log ? logTicks(this.y0, this.y1) : ticks(this.y0, this.y1, (bottom - top) / 45);
+    ctx.strokeStyle = "#E4E4E4";
+    ctx.lineWidth = 1;
+    ctx.beginPath();
+    for (const v of xs) { ctx.moveTo(this.x(v), top); ctx.lineTo(this.x(v), bottom); }
+    const height = (v) => bottom - (v - this.y0) * this.sy;
+    for (const v of ys) { ctx.moveTo(left, height(v)); ctx.lineTo(right, height(v)); }
+    ctx.stroke();
+    ctx.strokeStyle = "#555555";
+    ctx.beginPath();
+    ctx.moveTo(left, top); ctx.lineTo(left, bottom); ctx.lineTo(right, bottom);
+    ctx.stroke();
+    ctx.fillStyle = INK;
+    for (const v of xs) drawText(ctx, tickText(v, false), this.x(v), bottom + 16, "center", SMALL);
+    for (const v of ys) drawText(ctx, tickText(v, this.log), left - 6, height(v) + 4, "right", SMALL);
+    this.labels(ctx, panel);
+  }
+
+  labels(ctx, panel) {
+    const { left, top, right, bottom } = this.box;
+    ctx.fillStyle = INK;
+    drawText(ctx, panel.x, (left + right) / 2, bottom + 35, "center");
+    ctx.save();
+    ctx.translate(15, (top + bottom) / 2);
+    ctx.rotate(-Math.PI / 2);
+    drawText(ctx, panel.y, 0, 0, "center");
+    ctx.restore();
+    if (panel.title) drawText(ctx, panel.title, left, 19);
+  }
+}
+
+// ---- layers: each draws one kind; `get` fetches a named array, `cursor` is the time index
+
+const draw = {
+  lines(ctx, ax, layer, get, cursor) {
+    const x = get(layer.x), y = get(layer.y);
+    const [count, length] = layer.y.shape;
+    const shared = layer.x.shape.length === 1;
+    const animated = cursor !== null && layer.head;
+    ctx.lineWidth = layer.width ?? 1.4;
+    ctx.setLineDash(layer.dash ? [6, 4] : []);
+    const alpha = layer.alpha ?? Math.min(0.95, Math.max(0.3, 3 / Math.sqrt(count)));
+    for (let k = 0; k < count; k++) {
+      const xs = shared ? x : x.subarray(k * length, (k + 1) * length);
+      const ys = y.subarray(k * length, (k + 1) * length);
+      ctx.globalAlpha = animated ? 0.3 * alpha : alpha;
+      trace(ctx, ax, xs, ys, length);
+      if (animated) {
+        ctx.globalAlpha = alpha;
+        trace(ctx, ax, xs, ys, Math.min(cursor + 1, length));
+        ctx.globalAlpha = 1;
+        const at = Math.min(cursor, length - 1);
+        marker(ctx, "dot", ax.x(xs[at]), ax.y(ys[at]), 4);
+      }
+    }
+    ctx.setLineDash([]);
+  },
+
+  points(ctx, ax, layer, get, cursor) {
+    let x = get(layer.x), y = get(layer.y);
+    if (layer.x.shape.length === 2) {
+      const [frames, count] = layer.x.shape;
+      const at = Math.min(cursor ?? frames - 1, frames - 1) * count;
+      x = x.subarray(at, at + count);
+      y = y.subarray(at, at + count);
+    }
+    ctx.globalAlpha = layer.alpha ?? 0.9;
+    ctx.lineWidth = 2;
+    for (let k = 0; k < x.length; k++) {
+      marker(ctx, layer.marker ?? "dot", ax.x(x[k]), ax.y(y[k]), layer.radius ?? 5);
+    }
+  },
+
+  arrows(ctx, ax, layer, get) {
+    const x = get(layer.x), y = get(layer.y), dx = get(layer.dx), dy = get(layer.dy);
+    ctx.lineWidth = 1;
+    ctx.beginPath();
+    for (let k = 0; k < x.length; k++) {
+      const px = ax.x(x[k]), py = ax.y(y[k]);
+      const vx = dx[k] * ax.sx, vy = -dy[k] * ax.sy;
+      if (!Number.isFinite(vx + vy) || Math.hypot(vx, vy) < 1) continue;
+      ctx.moveTo(px, py);
+      ctx.lineTo(px + vx, py + vy);
+      ctx.lineTo(px + 0.7 * vx - 0.16 * vy, py + 0.7 * vy + 0.16 * vx);
+      ctx.moveTo(px + vx, py + vy);
+      ctx.lineTo(px + 0.7 * vx + 0.16 * vy, py + 0.7 * vy - 0.16 * vx);
+    }
+    ctx.stroke();
+  },
+
+  band(ctx, ax, layer, get) {
+    const x = get(layer.x), low = get(layer.y), high = get(layer.y2);
+    ctx.globalAlpha = layer.alpha;
+    ctx.beginPath();
+    for (let k = 0; k < x.length; k++) ctx.lineTo(ax.x(x[k]), ax.y(low[k]));
+    for (let k = x.length - 1; k >= 0; k--) ctx.lineTo(ax.x(x[k]), ax.y(high[k]));
+    ctx.fill();
+  },
+
+  shade(ctx, ax, layer) {
+    const { left, top, right, bottom } = ax.box;
+    const [low, high] = layer.span;
+    ctx.globalAlpha = layer.alpha;
+    if (layer.axis === "x") {
+      const a = low === null ? left : ax.x(low), b = high === null ? right : ax.x(high);
+      ctx.fillRect(a, top, b - a, bottom - top);
+    } else {
+      const a = low === null ? bottom : ax.y(low), b = high === null ? top : ax.y(high);
+      ctx.fillRect(left, b, right - left, a - b);
+    }
+  },
+
+  rule(ctx, ax, layer, get) {
+    const { left, top, right, bottom } = ax.box;
+    const value = get(layer.value)[0];
+    ctx.lineWidth = layer.width ?? 1.3;
+    ctx.setLineDash(layer.dash ? [6, 4] : []);
+    ctx.beginPath();
+    if (layer.axis === "x") { ctx.moveTo(ax.x(value), top); ctx.lineTo(ax.x(value), bottom); }
+    else { ctx.moveTo(left, ax.y(value)); ctx.lineTo(right, ax.y(value)); }
+    ctx.stroke();
+    ctx.setLineDash([]);
+  },
+};
+
+function trace(ctx, ax, xs, ys, length) {
+  let open = false, lastX = 0, lastY = 0;
+  ctx.beginPath();
+  for (let k = 0; k < length; k++) {
+    const px = ax.x(xs[k]), py = ax.y(ys[k]);
+    if (!Number.isFinite(px + py)) { open = false; continue; }
+    if (!open) ctx.moveTo(px, py);
+    else if (Math.abs(px - lastX) + Math.abs(py - lastY) < 0.6 && k < length - 1) continue;
+    else ctx.lineTo(px, Math.max(-1e5, Math.min(1e5, py)));
+    [open, lastX, lastY] = [true, px, py];
+  }
+  ctx.stroke();
+}
+
+function marker(ctx, shape, x, y, r) {
+  if (!Number.isFinite(x + y)) return;
+  ctx.beginPath();
+  if (shape === "cross") {
+    ctx.moveTo(x - r, y - r); ctx.lineTo(x + r, y + r);
+    ctx.moveTo(x - r, y + r); ctx.lineTo(x + r, y - r);
+    ctx.stroke();
+    return;
+  }
+  ctx.arc(x, y, r, 0, 2 * Math.PI);
+  if (shape === "ring") ctx.stroke();
+  else ctx.fill();
+}
+
+function mix(value, limit) {
+  const share = Math.max(-1, Math.min(1, value / limit)) * 0.75;
+  const strong = share < 0 ? [224, 130, 20] : [94, 76, 154];
+  return `rgb(${strong.map((c) => Math.round(247 + (c - 247) * Math.abs(share))).join(",")})`;
+}
+
+function drawCells(ctx, panel, layer, get, cursor, width, height) {
+  const [rows, columns] = layer.values.shape.slice(-2);
+  let values = get(layer.values);
+  if (layer.values.shape.length === 3) {
+    const at = Math.min(cursor ?? layer.values.shape[0] - 1, layer.values.shape[0] - 1);
+    values = values.subarray(at * rows * columns, (at + 1) * rows * columns);
+  }
+  const top = panel.title ? 34 : 8, side = Math.min((width - 16) / columns, (height - top - 8) / rows);
+  const left = (width - side * columns) / 2;
+  const limit = values.reduce((a, v) => (Number.isFinite(v) ? Math.max(a, Math.abs(v)) : a), 1e-30);
+  for (let k = 0; k < values.length; k++) {
+    const x = left + side * (k % columns), y = top + side * Math.floor(k / columns);
+    const zero = Math.abs(values[k]) <= 1e-6 * limit;
+    ctx.fillStyle = mix(zero ? 0 : values[k], limit);
+    ctx.fillRect(x + 1, y + 1, side - 2, side - 2);
+    ctx.fillStyle = zero ? "#999999" : "#111111";
+    const text = zero ? "0" : String(+values[k].toPrecision(2)).replace("-", "−");
+    drawText(ctx, text, x + side / 2, y + side / 2 + 4, "center");
+  }
+  ctx.fillStyle = INK;
+  if (panel.title) drawText(ctx, panel.title, 8, 19);
+}
+
+function drawLegend(ctx, ax, layers) {
+  const named = layers.filter((layer) => layer.label);
+  if (!named.length) return;
+  const width = Math.max(...named.map((layer) => textWidth(ctx, layer.label, SMALL))) + 34;
+  const x = ax.box.right - width, y = ax.box.top + 2;
+  ctx.globalAlpha = 0.82;
+  ctx.fillStyle = "white";
+  ctx.fillRect(x, y, width, 18 * named.length + 4);
+  ctx.globalAlpha = 1;
+  named.forEach((layer, k) => {
+    const cy = y + 18 * k + 11;
+    ctx.fillStyle = ctx.strokeStyle = layer.color;
+    ctx.lineWidth = 2.2;
+    if (layer.kind === "points") marker(ctx, layer.marker ?? "dot", x + 14, cy, 4);
+    else if (layer.kind === "band" || layer.kind === "shade") {
+      ctx.globalAlpha = 0.35; ctx.fillRect(x + 5, cy - 5, 18, 10); ctx.globalAlpha = 1;
+    } else {
+      ctx.setLineDash(layer.dash ? [5, 3] : []);
+      ctx.beginPath(); ctx.moveTo(x + 4, cy); ctx.lineTo(x + 24, cy); ctx.stroke();
+      ctx.setLineDash([]);
+    }
+    ctx.fillStyle = INK;
+    drawText(ctx, layer.label, x + 29, cy + 4, "left", SMALL);
+  });
+}
+
+function drawPanel(canvas, panel, get, cursor) {
+  const [width, height] = panel.size;
+  const ratio = window.devicePixelRatio || 1;
+  if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
+    canvas.width = Math.round(width * ratio);
+    canvas.height = Math.round(height * ratio);
+    canvas.style.width = `${width}px`;
+    canvas.style.aspectRatio = `${width} / ${height}`;
+  }
+  const ctx = canvas.getContext("2d");
+  ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+  ctx.globalAlpha = 1;
+  ctx.lineJoin = "round";
+  ctx.fillStyle = "white";
+  ctx.fillRect(0, 0, width, height);
+  const matrix = panel.layers.find((layer) => layer.kind === "cells");
+  if (matrix) {
+    drawCells(ctx, panel, matrix, get, cursor, width, height);
+    return;
+  }
+  const ax = new Axes(panel, width, height);
+  ax.draw(ctx, panel);
+  const { left, top, right, bottom } = ax.box;
+  ctx.save();
+  ctx.beginPath();
+  ctx.rect(left, top, right - left, bottom - top);
+  ctx.clip();
+  for (const layer of panel.layers) {
+    ctx.fillStyle = ctx.strokeStyle = layer.color;
+    ctx.globalAlpha = 1;
+    draw[layer.kind](ctx, ax, layer, get, cursor);
+  }
+  ctx.restore();
+  ctx.globalAlpha = 1;
+  drawLegend(ctx, ax, panel.layers);
+}
+
+// ---- the widget
+
+function element(tag, name, parent) {
+  const node = document.createElement(tag);
+  node.className = name;
+  parent.append(node);
+  return node;
+}
+
+function floats(data) {
+  if (!data) return new Float32Array(0);
+  const start = data.byteOffset ?? 0;
+  // The bytes may begin anywhere in a message, and float32 views want multiples of four.
+  return new Float32Array((data.buffer ?? data).slice(start, start + data.byteLength));
+}
+
+class View {
+  constructor(model, el) {
+    this.model = model;
+    this.root = element("div", "cmc-view", el);
+    this.row = element("div", "cmc-panels", this.root);
+    this.controls = element("div", "cmc-time", this.root);
+    this.status = element("div", "cmc-status", this.root);
+    this.alert = element("div", "cmc-error", this.root);
+    this.status.setAttribute("aria-live", "polite");
+    this.alert.setAttribute("role", "alert");
+    this.canvases = [];
+    this.cursor = null;
+    this.playing = null;
+    this.requested = null;
+    this.addControls();
+    this.onFrame = () => this.request();
+    this.onError = () => this.showError();
+    model.on("change:frame", this.onFrame);
+    model.on("change:error", this.onError);
+    this.draw();
+    this.showError();
+  }
+
+  addControls() {
+    this.button = element("button", "cmc-play", this.controls);
+    this.button.type = "button";
+    this.slider = element("input", "cmc-cursor", this.controls);
+    this.slider.type = "range";
+    this.slider.setAttribute("aria-label", "time cursor");
+    this.clock = element("span", "cmc-clock", this.controls);
+    this.button.addEventListener("click", () => (this.playing ? this.stop() : this.play()));
+    this.slider.addEventListener("input", () => {
+      this.stop();
+      this.cursor = +this.slider.value;
+      this.request();
+    });
+    // In a notebook a bare key is a command of the notebook unless it stays here.
+    this.controls.addEventListener("keydown", (event) => event.stopPropagation());
+    this.stop();
+  }
+
+  play() {
+    const began = performance.now();
+    const from = this.cursor >= +this.slider.max ? 0 : this.cursor;
+    const step = (now) => {
+      const last = +this.slider.max;
+      this.cursor = Math.min(last, Math.round(from + ((now - began) / 5000) * last));
+      this.draw();
+      if (this.cursor >= last) this.stop();
+      else this.playing = requestAnimationFrame(step);
+    };
+    this.playing = requestAnimationFrame(step);
+    this.button.textContent = "❚❚ pause";
+  }
+
+  stop() {
+    if (this.playing) cancelAnimationFrame(this.playing);
+    this.playing = null;
+    this.button.textContent = "▶ play";
+  }
+
+  request() {
+    // However many frames arrive before the next repaint, the newest alone is drawn.
+    this.requested ??= requestAnimationFrame(() => {
+      this.requested = null;
+      this.draw();
+    });
+  }
+
+  draw() {
+    const frame = this.model.get("frame");
+    if (!frame || !frame.panels) return;
+    if (this.frame !== frame) {
+      this.frame = frame;
+      this.data = floats(frame.data);
+      this.layout(frame);
+    }
+    const get = ({ at, shape }) => this.data.subarray(at, at + shape.reduce((a, b) => a * b, 1));
+    frame.panels.forEach((panel, k) => drawPanel(this.canvases[k], panel, get, this.cursor));
+    if (frame.time && this.cursor !== null) {
+      const t = get(frame.time)[this.cursor];
+      this.slider.value = this.cursor;
+      this.clock.textContent = `t = ${t.toFixed(2)} s`;
+      this.slider.setAttribute("aria-valuetext", this.clock.textContent);
+    }
+    this.root.dataset.serial = frame.serial;
+  }
+
+  layout(frame) {
+    while (this.canvases.length < frame.panels.length) {
+      const canvas = element("canvas", "cmc-panel", this.row);
+      canvas.setAttribute("role", "img");
+      this.canvases.push(canvas);
+    }
+    while (this.canvases.length > frame.panels.length) this.canvases.pop().remove();
+    frame.panels.forEach((panel, k) => {
+      const what = panel.title ? plain(panel.title) : `${plain(panel.y)} over ${plain(panel.x)}`;
+      this.canvases[k].setAttribute("aria-label", `${what}. ${this.model.get("description")}`);
+    });
+    if (this.status.textContent !== frame.text) this.status.textContent = frame.text;
+    this.controls.hidden = !frame.time;
+    if (frame.time) {
+      const last = frame.time.shape[0] - 1;
+      this.slider.max = last;
+      this.cursor = Math.min(this.cursor ?? last, last);
+    } else {
+      this.cursor = null;
+    }
+  }
+
+  showError() {
+    const error = this.model.get("error");
+    this.alert.textContent = error;
+    this.alert.hidden = !error;
+    this.row.classList.toggle("cmc-stale", Boolean(error));
+  }
+
+  remove() {
+    this.stop();
+    if (this.requested) cancelAnimationFrame(this.requested);
+    this.model.off("change:frame", this.onFrame);
+    this.model.off("change:error", this.onError);
+    this.root.remove();
+  }
+}
+
+function render({ model, el }) {
+  const view = new View(model, el);
+  return () => view.remove();
+}
+
+export default { render };

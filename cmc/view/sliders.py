@@ -1,0 +1,292 @@
+"""Sliders beside a picture that the browser draws. This module is the one door to live pictures.
+
+    def motion(damping: float) -> dict:          # a plain function: numbers in, arrays out
+        ...
+        return {"t": t, "y": y, "text": f"rate {rate:.2f} 1/s"}
+
+    explore(
+        motion,
+        panel(lines("t", "y"), x="time (s)", y="position (m)", ylim=(-2, 2)),
+        damping=slider(0.0, 3.0, 0.5, unit="1/s"),
+        describe="Twenty motions approach each other faster when damping grows.",
+    )
+
+The callback is called at once for the first values and for the ends of every slider, outside of
+any handler: if it fails there, the cell fails. What fails later is shown beside the picture and
+kept in `.errors`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import ipywidgets as widgets
+import numpy as np
+
+from cmc.view.canvas import Canvas, LiveCurve
+from cmc.view.layers import Source, arrows, band, cells, lines, paths, points, rule, shade
+from cmc.view.picture import Panel, panel
+
+__all__ = [
+    "Choice",
+    "Explorer",
+    "LiveCurve",
+    "Slider",
+    "arrows",
+    "band",
+    "cells",
+    "choice",
+    "explore",
+    "lines",
+    "panel",
+    "paths",
+    "points",
+    "rule",
+    "shade",
+    "slider",
+    "toggle",
+]
+
+_DEBOUNCE = 0.004  # s: changes that wait in the kernel's queue are answered by one frame
+
+
+@dataclass(frozen=True)
+class Slider:
+    """A number to move between two ends; made by `slider`."""
+
+    low: float
+    high: float
+    start: float
+    step: float
+    label: str
+    unit: str
+
+    @property
+    def probes(self) -> list[Any]:
+        """Values that the callback must survive: the ends."""
+        return [self.low, self.high]
+
+    def widget(self, name: str, *, slow: bool) -> widgets.ValueWidget:
+        """Return the control, labeled by its unit."""
+        unit = f" ({self.unit})" if self.unit else ""
+        whole = all(isinstance(v, int) for v in (self.low, self.high, self.start, self.step))
+        kind = widgets.IntSlider if whole else widgets.FloatSlider
+        digits = max(0, int(np.ceil(-np.log10(self.step) - 1e-9)))
+        return kind(
+            value=self.start,
+            min=self.low,
+            max=self.high,
+            step=self.step,
+            description=f"{self.label or name}{unit}",
+            continuous_update=not slow,
+            readout_format="d" if whole else f".{digits}f",
+            style={"description_width": "12em"},
+            layout={"width": "30em"},
+        )
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of several values; made by `choice` or `toggle`."""
+
+    options: tuple[Any, ...]
+    start: Any
+    label: str
+
+    @property
+    def probes(self) -> list[Any]:
+        """Values that the callback must survive: all of them."""
+        return list(self.options)
+
+    def widget(self, name: str, *, slow: bool) -> widgets.ValueWidget:
+        """Return the control: a check box for two truth values, a list otherwise."""
+        kind: Any = widgets.Dropdown
+        more: dict[str, Any] = {"options": self.options}
+        if set(self.options) == {False, True}:
+            kind, more = widgets.Checkbox, {"indent": True}
+        return kind(
+            value=self.start,
+            description=self.label or name,
+            style={"description_width": "12em"},
+            layout={"width": "30em"},
+            **more,
+        )
+
+
+Control = Slider | Choice
+
+
+def slider(
+    low: float,
+    high: float,
+    start: float | None = None,
+    *,
+    step: float | None = None,
+    label: str = "",
+    unit: str = "",
+) -> Slider:
+    """A slider from `low` to `high` that begins at `start` (the middle by default).
+
+    Whole numbers throughout make an integer slider.
+
+    Args:
+        low: lower end.
+        high: upper end.
+        start: first value.
+        step: what an arrow key adds; 1, or a hundredth of the range.
+        label: text before the slider; the parameter's name by default.
+        unit: unit of the value.
+
+    Raises:
+        ValueError: if the numbers are not finite or not in order.
+    """
+    whole = isinstance(low, int) and isinstance(high, int) and isinstance(start, int | None)
+    if step is None:
+        step = 1 if whole else (high - low) / 100
+    if start is None:
+        start = (low + high) // 2 if whole else (low + high) / 2
+    if not (np.isfinite([low, high, start, step]).all() and low <= start <= high and low < high):
+        raise ValueError(f"wanted finite low <= start <= high, got {low}, {start}, {high}")
+    if not 0 < step <= high - low:
+        raise ValueError(f"wanted 0 < step <= {high - low}, got {step}")
+    if not whole or not isinstance(step, int):
+        low, high, start, step = float(low), float(high), float(start), float(step)
+    return Slider(low, high, start, step, label, unit)
+
+
+def choice(*options: Any, start: Any = None, label: str = "") -> Choice:
+    """A list to choose one of `options` from; the first one by default."""
+    if len(options) < 2:
+        raise ValueError(f"wanted at least two options, got {options}")
+    start = options[0] if start is None else start
+    if start not in options:
+        raise ValueError(f"wanted a start among {options}, got {start!r}")
+    return Choice(tuple(options), start, label)
+
+
+def toggle(start: bool = False, *, label: str = "") -> Choice:
+    """A check box."""
+    return Choice((False, True), start, label)
+
+
+class Explorer(widgets.VBox):
+    """Controls above a canvas that follows them; made by `explore`.
+
+    Attributes:
+        canvas: the picture.
+        controls: name to ipywidgets control.
+        errors: one text for each time the callback failed after the first picture.
+    """
+
+    def __init__(
+        self,
+        callback: Callable[..., Mapping[str, Any]],
+        panels: tuple[Panel, ...],
+        controls: Mapping[str, Control],
+        describe: str,
+        time: Source | None = None,
+        slow: bool = False,
+    ) -> None:
+        if not controls:
+            raise ValueError("wanted at least one slider")
+        self.callback = callback
+        self.errors: list[str] = []
+        self._wanted: asyncio.TimerHandle | None = None
+        self.controls = {name: c.widget(name, slow=slow) for name, c in controls.items()}
+        self.canvas = Canvas(panels, describe, time)
+        for values in probes(controls, corners=not slow):
+            self.evaluate(**values)  # raises: a broken callback fails the cell
+        self._reset = widgets.Button(description="Reset", tooltip="back to the first values")
+        self._reset.on_click(lambda _: self.reset())
+        self._first = {name: widget.value for name, widget in self.controls.items()}
+        for widget in self.controls.values():
+            widget.observe(self._changed, "value")
+        super().__init__([*self.controls.values(), self._reset, self.canvas])
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """Present values of the controls."""
+        return {name: widget.value for name, widget in self.controls.items()}
+
+    def evaluate(self, **values: Any) -> Mapping[str, Any]:
+        """Call the callback with the controls' values, replaced by `values`, and show the result.
+
+        Raises:
+            Exception: whatever the callback raises.
+            PictureError: if its arrays do not fit the layers.
+        """
+        data = self.callback(**{**self.values, **values})
+        self.canvas.show(data)
+        return data
+
+    def reset(self) -> None:
+        """Move every control back to its first value."""
+        for name, widget in self.controls.items():
+            widget.value = self._first[name]
+
+    def _changed(self, _: Any) -> None:
+        try:
+            loop = asyncio.get_running_loop()
+        except RuntimeError:
+            self._refresh()
+            return
+        if self._wanted is None:
+            self._wanted = loop.call_later(_DEBOUNCE, self._refresh)
+
+    def _refresh(self) -> None:
+        self._wanted = None
+        values = self.values
+        try:
+            self.evaluate()
+        except Exception as error:
+            # A handler's exception would reach nobody: it is shown and kept instead.
+            said = "".join(traceback.format_exception_only(error)).strip()
+            at = ", ".join(f"{name} = {value}" for name, value in values.items())
+            self.errors.append(f"{said} (at {at})")
+            self.canvas.fail(self.errors[-1])
+
+
+def explore(
+    callback: Callable[..., Mapping[str, Any]],
+    *panels: Panel,
+    describe: str,
+    time: Source | None = None,
+    slow: bool = False,
+    **controls: Control,
+) -> Explorer:
+    """Show a picture that follows sliders.
+
+    The callback takes the controls' values by name and returns a mapping of names to arrays; the
+    panels' layers say which of them are drawn. Its entry `text` becomes the status line. It is
+    called at once for the first values and the ends of the sliders, and errors are raised here.
+
+    Args:
+        callback: plain function, parameters to arrays.
+        panels: what is drawn.
+        describe: one sentence for readers who do not see the picture.
+        time: key of the times (m,), s, of a time cursor: layers with `head` and dots or cells of
+            shape (time, ...) follow it, and a button plays the motion.
+        slow: answer only when a slider is released, and try fewer values at first.
+        controls: parameter name to `slider`, `choice` or `toggle`.
+    """
+    return Explorer(callback, panels, controls, describe, time, slow)
+
+
+def probes(controls: Mapping[str, Control], *, corners: bool) -> Iterator[dict[str, Any]]:
+    """Values to try a callback with: each end alone, corners of up to three controls, the start.
+
+    The start comes last, so that its picture is the one that stays.
+    """
+    start = {name: control.start for name, control in controls.items()}
+    for name, control in controls.items():
+        yield from ({**start, name: value} for value in control.probes)
+    several = 1 < len(controls) <= 3
+    if corners and several and np.prod([len(c.probes) for c in controls.values()]) <= 16:
+        for ends in itertools.product(*(c.probes for c in controls.values())):
+            yield dict(zip(controls, ends, strict=True))
+    yield start
