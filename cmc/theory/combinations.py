@@ -1,0 +1,244 @@
+"""Two ways to combine modules so that stable ones stay stable: hierarchical and feedback.
+
+Hierarchical: the coupling goes one way (real eigenvalues). Feedback: the coupling of i into j is
+minus the transpose of j into i, so that it moves no energy (complex pairs). The paper leaves the
+feedback form open; the closed forms here are this project's own.
+
+Order of a hierarchy: the explicit solution empties the blocks below the diagonal (module 1 listens
+to all, module n to none), where the paper's section on combinations empties the upper right one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import ArrayLike
+
+from cmc.theory.auxiliary import AuxiliarySpace, decompose, inverse, triangularize
+from cmc.theory.differential import F, checked_slopes, subsystems
+from cmc.theory.spectrum import (
+    MAX_CONDITION,
+    Array,
+    ComplexEigenvalueError,
+    DefectiveMatrixError,
+    SingularInputError,
+    checked_pair,
+    checked_square,
+    raise_complex,
+    raise_defective,
+)
+
+
+def hierarchical(f_y: ArrayLike, f_u: ArrayLike) -> AuxiliarySpace:
+    """Return the explicit solution: Lambda diagonal, R upper triangular; see `decompose`.
+
+    Raises:
+        ComplexEigenvalueError: If `f_y` has a complex pair.
+        DefectiveMatrixError: If `f_y` lacks eigenvectors.
+        SingularInputError: If `f_u` is singular.
+        TypeError: If the entries are not real numbers.
+        ValueError: If shapes do not fit or an entry is not finite.
+    """
+    return decompose(f_y, f_u)
+
+
+def schur(f_y: ArrayLike, f_u: ArrayLike) -> AuxiliarySpace:
+    """Return a hierarchy with orthogonal transforms: Lambda and R both upper triangular.
+
+    `f_y = U S U^T`, `T_y = U^T`: real eigenvalues suffice, eigenvectors need not exist, and
+    cond(T_y) is 1. Lambda couples the modules then, but still one way only, so theorem 2 holds
+    unchanged.
+
+    Args:
+        f_y: Jacobian of the plant in `y` [1/s], (n, n), with real eigenvalues.
+        f_u: Jacobian of the plant in `u`, (n, n), invertible.
+
+    Raises:
+        ComplexEigenvalueError: If `f_y` has a complex pair.
+        SingularInputError: If `f_u` is singular.
+        TypeError: If the entries are not real numbers.
+        ValueError: If shapes do not fit, are a batch, or an entry is not finite.
+
+    Source: our own addition; the paper asks for a diagonalizable `f_y`.
+    """
+    f_y, f_u = checked_pair(f_y, f_u)
+    if f_y.ndim != 2:
+        raise ValueError(f"schur takes one system, (n, n), got {f_y.shape}")
+    S, U = scipy.linalg.schur(f_y, output="real")
+    below = np.diagonal(S, -1)
+    if np.any(below != 0.0):
+        k = int(np.flatnonzero(below)[0])
+        raise_complex(float(S[k, k]), float(np.sqrt(-S[k, k + 1] * S[k + 1, k])))
+    T_a, R = triangularize(U.T @ f_u)
+    return AuxiliarySpace(U.T, T_a, S, R)
+
+
+def feedback(f_y: ArrayLike, f_u: ArrayLike, slopes: ArrayLike | None = None) -> AuxiliarySpace:
+    """Return the feedback combination: `T_y` brings `f_y` to real block form, `T_a` follows.
+
+    Without slopes, `T_a = (T_y f_u)^-1`, so R = I: the form for policies, whose slopes vary.
+    Modules are coupled by the rotations of Lambda alone, which change no distance: with constant
+    Pi_2 and `V = |dz|^2 - dI^T Pi_2 dI`, I = int z, `V' = 2 dz^T (sym(Lambda) + Pi_1) dz`. Real and
+    complex eigenvalues may be mixed.
+
+    With slopes, `T_a = (T_y f_u)^-1 B`, the block form of the paper's feedback combination: each
+    pair `[[s, w], [-w, s]]` gets `B = [[p_1 s - q_1, p_2 w], [-p_1 w, p_2 s - q_2]]`, p and q the
+    slopes. Then the coupling blocks are exactly skew and sym(F) < 0. It needs s < 0 and *constant*
+    slopes: `T_a` depends on them, so with slopes that vary with the state it is a different system.
+
+    Args:
+        f_y: Jacobian of the plant in `y` [1/s], (..., n, n).
+        f_u: Jacobian of the plant in `u`, (..., n, n), invertible.
+        slopes: Constant negative slopes, (..., n, 2), or None for policies.
+
+    Raises:
+        DefectiveMatrixError: If `f_y` lacks (complex) eigenvectors.
+        SingularInputError: If `f_u` is singular.
+        TypeError: If the entries are not real numbers.
+        ValueError: If shapes do not fit, an entry is not finite, slopes are not negative, or (with
+            slopes) an eigenvalue has a real part that is not negative.
+
+    Source: our own; the paper says that existence "needs further study".
+    """
+    f_y, f_u = checked_pair(f_y, f_u)
+    T_y, Lambda = real_block_form(f_y)
+    T_a = inverse(T_y @ f_u)
+    if slopes is None:
+        return AuxiliarySpace(T_y, T_a, Lambda, np.broadcast_to(np.eye(f_y.shape[-1]), T_y.shape))
+    B = feedback_gain(Lambda, slopes)
+    T_y, T_a, Lambda, B = np.broadcast_arrays(T_y, T_a @ B, Lambda, B)
+    return AuxiliarySpace(T_y, T_a, Lambda, B)
+
+
+def real_block_form(f_y: ArrayLike) -> tuple[Array, Array]:
+    """Return `T_y` and `Lambda = T_y f_y T_y^-1`, block diagonal and real, each (..., n, n).
+
+    A real eigenvalue is a 1x1 block, a pair s +- w j the block `[[s, w], [-w, s]]`, w > 0, with the
+    columns Re v and Im v of a unit eigenvector v whose largest component is positive. Real parts
+    descend.
+
+    Raises:
+        DefectiveMatrixError: If `f_y` lacks eigenvectors, to working precision.
+        TypeError: If the entries are not real numbers.
+        ValueError: If `f_y` is not (..., n, n) or an entry is not finite.
+    """
+    f_y = checked_square(f_y, "f_y")
+    eigenvalues, V = np.linalg.eig(f_y)
+    eigenvalues, V = eigenvalues.astype(np.complex128), V.astype(np.complex128)
+    # numpy lists a pair side by side, +w first; a stable sort by real part keeps it so
+    order = np.argsort(-eigenvalues.real, axis=-1, kind="stable")
+    eigenvalues = np.take_along_axis(eigenvalues, order, axis=-1)
+    V = np.take_along_axis(V, order[..., None, :], axis=-1)
+    rows = np.abs(V).argmax(axis=-2)[..., None, :]
+    largest = np.take_along_axis(V, rows, axis=-2)
+    V = V * (np.abs(largest) / largest)
+    w = eigenvalues.imag
+    # f_y (Re v, Im v) = (Re v, Im v) [[s, w], [-w, s]]; the partner -w gives the column Im v
+    basis = np.where(w[..., None, :] < 0.0, -V.imag, V.real)
+    if not (np.linalg.cond(V) <= MAX_CONDITION).all():
+        raise_defective()
+    n = f_y.shape[-1]
+    Lambda = np.zeros(f_y.shape)
+    Lambda[..., range(n), range(n)] = eigenvalues.real
+    i = np.arange(n - 1)
+    Lambda[..., i, i + 1] = np.maximum(w[..., :-1], 0.0)
+    Lambda[..., i + 1, i] = np.minimum(w[..., 1:], 0.0)
+    return inverse(basis), Lambda
+
+
+def feedback_gain(Lambda: ArrayLike, slopes: ArrayLike) -> Array:
+    """Return B = `T_y f_u T_a` of the block form, (..., n, n), for `Lambda` from `real_block_form`.
+
+    `B = Pi_1 sym(Lambda) - Pi_2 + skew(Lambda) Pi_1`, that is `b_ii = p_i s - q_i > 0`,
+    `b_12 = p_2 w`, `b_21 = -p_1 w`.
+
+    Raises:
+        ValueError: If shapes do not fit, slopes are not negative, or a real part is not negative.
+    """
+    L = checked_square(Lambda, "Lambda")
+    s = checked_slopes(slopes, L.shape[-1])
+    if not (s < 0.0).all():
+        raise ValueError(f"slopes must be negative here (R_ii > 0), got a largest of {s.max():.6g}")
+    real = np.diagonal(L, axis1=-2, axis2=-1)
+    if not (real < 0.0).all():
+        raise ValueError(
+            f"the block form needs negative real parts, got {real.max():.6g} 1/s; use feedback("
+            "f_y, f_u) without slopes, and policies steeper than slope_floor"
+        )
+    eye = np.eye(L.shape[-1])
+    return L * (1.0 - eye) * s[..., None, :, 0] + (s[..., 0] * real - s[..., 1])[..., None, :] * eye
+
+
+def coupling_skewness(space: AuxiliarySpace, slopes: ArrayLike) -> Array:
+    """Return the largest entry of `F_ij + F_ji^T`, i != j, shape (...): zero for feedback.
+
+    Raises:
+        ValueError: If shapes do not fit or an entry is not finite.
+    """
+    parts = subsystems(F(space, slopes))
+    mirrored = np.swapaxes(np.swapaxes(parts, -4, -3), -2, -1)
+    off = ~np.eye(space.n, dtype=bool)
+    return np.abs((parts + mirrored)[..., off, :, :]).max(axis=(-3, -2, -1), initial=0.0)
+
+
+@dataclass(frozen=True)
+class Possibility:
+    """Whether a combination exists for a plant, and why."""
+
+    name: str
+    """hierarchical, schur, feedback (policies) or feedback (constant slopes)."""
+    possible: bool
+    reason: str
+    """One sentence for a person."""
+
+
+def possible_combinations(f_y: ArrayLike, f_u: ArrayLike) -> tuple[Possibility, ...]:
+    """Say which combinations exist for one plant, each with its reason.
+
+    Args:
+        f_y: Jacobian of the plant in `y` [1/s], (n, n).
+        f_u: Jacobian of the plant in `u`, (n, n).
+
+    Raises:
+        TypeError: If the entries are not real numbers.
+        ValueError: If shapes do not fit, are a batch, or an entry is not finite.
+    """
+    if np.ndim(f_y) != 2:
+        raise ValueError(f"one plant at a time, f_y of shape (n, n), got {np.shape(f_y)}")
+    names = ("hierarchical", "schur", "feedback (policies)", "feedback (constant slopes)")
+    try:
+        checked_pair(f_y, f_u)
+    except SingularInputError as error:
+        return tuple(Possibility(name, False, str(error)) for name in names)
+    eigenvalues = np.linalg.eigvals(checked_square(f_y, "f_y"))
+    slow = float(eigenvalues.real.max())
+    floor = "" if slow < 0.0 else f"; |d pi/dz| must exceed {slow:.6g} everywhere (slope floor)"
+    answers = [
+        _try(names[0], hierarchical, f_y, f_u, "f_y is real-diagonalizable: couplings go one way"),
+        _try(names[1], schur, f_y, f_u, "f_y has real eigenvalues: triangular by a rotation"),
+        _try(names[2], feedback, f_y, f_u, f"f_u is invertible: R = I, couplings rotate{floor}"),
+    ]
+    possible, reason = answers[2].possible, "every real part is negative: skew couplings"
+    if possible and slow >= 0.0:
+        possible, reason = False, f"the real part {slow:.6g} 1/s is not negative"
+    answers.append(
+        Possibility(names[3], possible, reason if answers[2].possible else answers[2].reason)
+    )
+    return tuple(answers)
+
+
+def _try(
+    name: str,
+    build: Callable[[ArrayLike, ArrayLike], AuxiliarySpace],
+    f_y: ArrayLike,
+    f_u: ArrayLike,
+    reason: str,
+) -> Possibility:
+    try:
+        build(f_y, f_u)
+    except (ComplexEigenvalueError, DefectiveMatrixError) as error:
+        return Possibility(name, False, str(error))
+    return Possibility(name, True, reason)
