@@ -1,0 +1,181 @@
+"""Disturbances: the worst ones for a linear loop, exactly, and bounded random ones.
+
+The error ball of `cmc.theory.robustness` is an upper bound. What is here says how much of it can
+be reached: `worst_constant` (a matrix norm), `peak_gain` (the worst signal of all, an integral) and
+`tightest_ellipsoid` (the best any constant metric can promise about one signal).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import expm, solve_continuous_lyapunov
+from scipy.optimize import minimize_scalar
+
+from cmc.theory.contraction import metric_factor
+
+Array = NDArray[np.float64]
+
+KINDS = ("constant", "switching", "sine", "white")
+
+
+def _stable(jacobian: ArrayLike) -> tuple[Array, float]:
+    J = np.asarray(jacobian, float)
+    if J.ndim != 2 or J.shape[0] != J.shape[1] or not np.isfinite(J).all():
+        raise ValueError(f"wanted a finite Jacobian of shape (n, n), got {J.shape}")
+    abscissa = float(np.linalg.eigvals(J).real.max())
+    if not abscissa < 0.0:
+        raise ValueError(f"the loop is not stable: largest real part {abscissa:.3g} 1/s")
+    return J, abscissa
+
+
+def _impulse_response(J: Array, channel: ArrayLike, row: ArrayLike, times: Array) -> Array:
+    """Rows row e^{J t} B at many times, (..., m)."""
+    B, c = np.asarray(channel, float), np.asarray(row, float)
+    values, V = np.linalg.eig(J)
+    if np.linalg.cond(V) > 1e6:  # nearly defective: the eigenvectors lose too many digits
+        slow: Array = c @ expm(times[..., None, None] * J) @ B
+        return slow
+    modes = (c @ V)[:, None] * np.linalg.solve(V, B)
+    return np.real(np.exp(times[..., None] * values) @ modes)
+
+
+def worst_constant(
+    jacobian: ArrayLike, channel: ArrayLike, metric: ArrayLike | None = None
+) -> tuple[float, Array]:
+    """The constant disturbance of size 1 that displaces a linear loop most, exactly.
+
+    At rest 0 = J xi + B d, so the displacement is -J^{-1} B d, and the largest one is a singular
+    value.
+
+    Args:
+        jacobian: J, (n, n), Hurwitz.
+        channel: B, (n, m).
+        metric: measure the displacement in this metric; Euclidean by default.
+
+    Returns:
+        The largest displacement per unit of disturbance, and the disturbance (m,) that causes it.
+
+    Raises:
+        ValueError: if the loop is not stable.
+    """
+    J, _ = _stable(jacobian)
+    theta = np.eye(len(J)) if metric is None else metric_factor(metric)
+    _, sizes, directions = np.linalg.svd(-theta @ np.linalg.solve(J, np.asarray(channel, float)))
+    return float(sizes[0]), directions[0]
+
+
+def worst_signal(
+    jacobian: ArrayLike, channel: ArrayLike, row: ArrayLike, times: ArrayLike
+) -> tuple[Array, Array]:
+    """The disturbance ||d(t)|| <= 1 that makes row xi largest at the last of `times`.
+
+    d(t) points along B^T e^{J^T (T - t)} row^T, and what it reaches is the integral of the length
+    of that vector. Evaluated at the middle of each step and held, as in `robustness.respond`.
+
+    Returns:
+        Disturbances (steps, m) for the steps between `times` (steps + 1,), and the exact reach
+        |row xi(t_k)| of the worst signal aimed at each of `times`, (steps + 1,).
+    """
+    J, _ = _stable(jacobian)
+    t = np.asarray(times, float)
+    middle = 0.5 * (t[1:] + t[:-1])
+    weight = _impulse_response(J, channel, row, t[-1] - middle)
+    length = np.linalg.norm(weight, axis=-1, keepdims=True)
+    signal = np.divide(weight, length, out=np.zeros_like(weight), where=length > 0.0)
+    elapsed = _impulse_response(J, channel, row, middle - t[0])
+    reach = np.cumsum(np.linalg.norm(elapsed, axis=-1) * np.diff(t))
+    return signal, np.concatenate([[0.0], reach])
+
+
+def peak_gain(jacobian: ArrayLike, channel: ArrayLike, row: ArrayLike) -> float:
+    """Largest |row xi| that any disturbance ||d(t)|| <= 1 can ever cause, from rest.
+
+    The integral of ||row e^{J t} B|| over t >= 0, by Gauss-Legendre panels.
+
+    Args:
+        jacobian: J, (n, n), Hurwitz.
+        channel: B, (n, m).
+        row: (n,).
+
+    Raises:
+        ValueError: if the loop is not stable.
+    """
+    J, abscissa = _stable(jacobian)
+    values = np.linalg.eigvals(J)
+    end, turning = 40.0 / -abscissa, float(np.abs(values.imag).max())
+    edges = np.concatenate([[0.0], np.geomspace(1e-3 / np.abs(values).max(), end, 400)])
+    if turning > 0.0:  # several panels to each half turn, because the length has kinks
+        edges = np.union1d(edges, np.arange(0.0, end, 0.1 * np.pi / turning))
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    half = 0.5 * np.diff(edges)[:, None]
+    t = edges[:-1, None] + half * (1.0 + nodes)
+    length = np.linalg.norm(_impulse_response(J, channel, row, t), axis=-1)
+    return float((length * half * weights).sum())
+
+
+def tightest_ellipsoid(
+    jacobian: ArrayLike, channel: ArrayLike, row: ArrayLike
+) -> tuple[Array, float]:
+    """The constant metric that promises most about one signal under ||d|| <= 1.
+
+    For a in (0, -2 max Re lambda) let J Q + Q J^T + a Q + B B^T / a = 0. Then from rest
+    xi^T Q^{-1} xi <= 1 for ever, so |row xi| <= sqrt(row Q row^T); a is searched for the smallest.
+    (Abedor, Nagpal, Poolla 1996.)
+
+    Returns:
+        The metric M = Q^{-1}, in which the disturbed loop stays within distance 1, and the bound
+        on |row xi|.
+
+    Raises:
+        ValueError: if the loop is not stable.
+    """
+    J, abscissa = _stable(jacobian)
+    B, c = np.asarray(channel, float), np.asarray(row, float)
+
+    def ellipsoid(a: float) -> Array:
+        Q = solve_continuous_lyapunov(J + 0.5 * a * np.eye(len(J)), -B @ B.T / a)
+        return 0.5 * (Q + Q.T)
+
+    def reach(logit: float) -> float:
+        return float(c @ ellipsoid(-2.0 * abscissa / (1.0 + np.exp(-logit))) @ c)
+
+    found = minimize_scalar(reach, bounds=(-8.0, 8.0), method="bounded")
+    best = ellipsoid(-2.0 * abscissa / (1.0 + np.exp(-found.x)))
+    metric = np.asarray(np.linalg.inv(best), dtype=np.float64)
+    return metric, float(np.sqrt(c @ best @ c))
+
+
+def random_disturbances(
+    rng: np.random.Generator, steps: int, batch: int, size: float, *, step: float, m: int = 1
+) -> Array:
+    """Bounded disturbances of four kinds in turn (`KINDS`), each with ||d(t)|| <= size.
+
+    Trajectory j is of kind KINDS[j % 4]: a constant; one that switches sign at random; a sine of
+    random frequency (up to a tenth of the step rate) and phase; an independent draw at each step.
+
+    Args:
+        rng: source of randomness.
+        steps: number of time steps.
+        batch: number of trajectories.
+        size: bound on the norm.
+        step: s.
+        m: dimension of the disturbance.
+
+    Returns:
+        Array (steps, batch, m).
+    """
+    if steps < 1 or batch < 1 or m < 1 or not size >= 0.0:
+        raise ValueError(f"wanted steps, batch, m >= 1 and size >= 0, got {steps, batch, m, size}")
+    direction = rng.normal(size=(batch, m))
+    direction *= size / np.linalg.norm(direction, axis=-1, keepdims=True)
+    kind = np.arange(batch) % len(KINDS)
+    t = step * np.arange(steps)[:, None]
+    course = np.ones((steps, batch))
+    switching = rng.random((steps, batch)) < rng.uniform(0.001, 0.2, batch)
+    frequency = 10.0 ** rng.uniform(-1.0, np.log10(0.1 / step), batch)
+    sine = np.sin(2.0 * np.pi * (frequency * t + rng.random(batch)))
+    course = np.where(kind == 1, 1.0 - 2.0 * (switching.cumsum(axis=0) % 2), course)
+    course = np.where(kind == 2, sine, course)
+    course = np.where(kind == 3, rng.uniform(-1.0, 1.0, (steps, batch)), course)
+    return course[..., None] * direction
