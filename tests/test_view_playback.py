@@ -1,0 +1,394 @@
+"""Playback without a browser: what is recorded, how it is packed, what the live view leaves."""
+
+import asyncio
+import base64
+import json
+import re
+import socket
+import threading
+import time
+import urllib.error
+import urllib.request
+
+import mujoco
+import numpy as np
+import pytest
+import umsgpack
+from tornado.httpclient import HTTPClientError, HTTPRequest
+from tornado.websocket import websocket_connect
+
+from cmc.view.playback import Arrow, Camera, Marker, around, notebook, record
+from cmc.view.playback.cameras import FIELD_OF_VIEW
+from cmc.view.playback.geometry import color, geom_mesh
+from cmc.view.playback.page import scene_data, scene_id
+
+SCENE = """
+<mujoco>
+  <asset>
+    <material name="blue" rgba=".2 .6 .9 1"/>
+    <mesh name="tetrahedron" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/>
+  </asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 .1"/>
+    <geom name="pad" type="plane" size=".2 .3 .1" pos="0 0 .001"/>
+    <geom name="post" type="cylinder" size=".02 .3" pos=".5 .2 .3"/>
+    <geom name="hidden" type="sphere" size=".1" group="3"/>
+    <geom name="clear" type="sphere" size=".1" rgba="1 1 1 0"/>
+    <body name="torso" pos="0 0 .8">
+      <freejoint/>
+      <geom name="chest" type="capsule" size=".07" fromto="0 -.1 0 0 .1 0" material="blue"/>
+      <geom name="belly" type="ellipsoid" size=".08 .05 .1" pos="0 0 -.15" rgba=".9 .6 .2 1"/>
+      <body name="head/top" pos="0 0 .2">
+        <joint axis="0 1 0"/>
+        <geom name="head" type="sphere" size=".09" rgba=".9 .4 .4 .7"/>
+      </body>
+      <body name="arm" pos="0 .2 0">
+        <joint axis="1 0 0"/>
+        <geom name="bone" type="cylinder" size=".04 .15" pos="0 .15 0" euler="90 0 0"/>
+        <body pos="0 .3 0">
+          <joint axis="0 0 1"/>
+          <geom name="hand" type="box" size=".05 .04 .02" pos="0 .06 0" euler="10 20 30"/>
+          <geom name="nail" type="mesh" mesh="tetrahedron" pos="0 .1 .05" euler="0 40 0"/>
+          <site name="tip" pos="0 .1 0"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+@pytest.fixture(scope="module")
+def model():
+    return mujoco.MjModel.from_xml_string(SCENE)
+
+
+def tumble(model, frames=40, seed=0):
+    """Joint positions (T, nq), full states (T, n) and times of a falling, turning body."""
+    data, full = mujoco.MjData(model), int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    data.qvel[:] = np.random.default_rng(seed).normal(size=model.nv)
+    qpos, states = [], np.empty((frames, mujoco.mj_stateSize(model, full)))
+    for k in range(frames):
+        mujoco.mj_step(model, data, 10)
+        mujoco.mj_getState(model, data, states[k], full)
+        qpos.append(data.qpos.copy())
+    return np.array(qpos), states, 0.02 * np.arange(1, frames + 1)
+
+
+@pytest.fixture(scope="module")
+def recording(model):
+    qpos, _, times = tumble(model)
+    return record(model, qpos, times, trails=["tip"], title="Tumble")
+
+
+def commands(recording):
+    return [umsgpack.unpackb(c) for c in recording.commands]
+
+
+def test_poses_equal_mujoco_s_and_static_bodies_are_not_stored(model, recording):
+    qpos, _, _ = tumble(model)
+    data = mujoco.MjData(model)
+    assert recording.bodies == ("torso", "head|top", "arm", "body4")
+    for k in (0, 17, 39):
+        data.qpos[:] = qpos[k]
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(recording.poses[k, :, :3], data.xpos[1:], atol=1e-7)
+        np.testing.assert_allclose(recording.poses[k, :, 3:], data.xquat[1:], atol=1e-7)
+        tip = data.site("tip").xpos
+        np.testing.assert_allclose(recording.overlays[0].points[k], tip, atol=1e-12)
+
+
+def test_full_states_and_lists_give_the_same_recording(model, recording):
+    qpos, states, times = tumble(model)
+    assert model.nq not in {states.shape[1]}
+    for given in (states, list(states), list(qpos)):
+        assert np.array_equal(record(model, given, times).poses, recording.poses)
+
+
+def test_geoms_stand_where_mujoco_puts_them(model, recording):
+    """Body pose times the drawn geom's transform is geom_xpos and geom_xmat, but for the axis."""
+    drawn = {c["path"]: np.reshape(c["matrix"], (4, 4)).T for c in commands(recording)
+             if c["type"] == "set_transform"}  # fmt: skip
+    data = mujoco.MjData(model)
+    data.qpos[:] = tumble(model)[0][0]
+    mujoco.mj_forward(model, data)
+    seen = 0
+    for geom in range(model.ngeom):
+        body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, model.geom_bodyid[geom])
+        body = (body or f"body{model.geom_bodyid[geom]}").replace("/", "|")
+        path = f"/meshcat/{body}/geom{geom}"
+        if path not in drawn:
+            assert model.geom(geom).name in ("hidden", "clear")
+            continue
+        seen += 1
+        world = drawn[f"/meshcat/{body}"] @ drawn[path]
+        rotation = data.geom_xmat[geom].reshape(3, 3)
+        np.testing.assert_allclose(world[:3, 3], data.geom_xpos[geom], atol=1e-12)
+        turned = model.geom(geom).name in ("post", "chest", "bone")
+        z_axis = world[:3, 1] if turned else world[:3, 2]
+        np.testing.assert_allclose(z_axis, rotation[:, 2], atol=1e-12)
+        assert np.linalg.det(world[:3, :3]) == pytest.approx(1.0)
+    assert seen == model.ngeom - 2
+
+
+def extent(mesh):
+    """Half-size of a meshcat object along its own axes."""
+    data = mesh.lower()
+    geometry = data["geometries"][0]
+    scale = np.abs(np.reshape(data["object"]["matrix"], (4, 4))[:3, :3]).sum(axis=0)
+    kind = geometry["type"]
+    if kind == "BoxGeometry":
+        return np.array([geometry["width"], geometry["height"], geometry["depth"]]) / 2 * scale
+    if kind == "SphereGeometry":
+        return geometry["radius"] * scale
+    if kind == "CylinderGeometry":
+        assert geometry["radiusTop"] == geometry["radiusBottom"]
+        return np.array([geometry["radiusTop"], geometry["height"] / 2, geometry["radiusTop"]])
+    if kind == "LatheGeometry":
+        x, y = np.array([[p["x"], p["y"]] for p in geometry["points"]]).T
+        return np.array([x.max(), y.max(), x.max()])
+    packed = geometry["data"]["attributes"]["position"]["array"].data
+    return np.abs(np.frombuffer(packed, np.float32).reshape(-1, 3)).max(axis=0)
+
+
+@pytest.mark.parametrize("name", ["post", "chest", "belly", "head", "bone", "hand", "nail", "pad"])
+def test_drawn_sizes_are_mujoco_s(model, name):
+    geom = model.geom(name).id
+    mesh, _ = geom_mesh(model, geom)
+    size = extent(mesh)
+    if name in ("post", "chest", "bone"):  # their axis is y here, z in MuJoCo
+        size = size[[0, 2, 1]]
+    center, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+    wanted = np.abs(np.stack([center - half, center + half])).max(axis=0)
+    if name == "pad":
+        wanted = np.array([0.2, 0.3, 0.0])
+    np.testing.assert_allclose(size, wanted, atol=1e-6)
+
+
+def test_capsule_surface_is_one_radius_from_its_axis(model):
+    geometry = geom_mesh(model, model.geom("chest").id)[0].lower()["geometries"][0]
+    points = np.array([[p["x"], p["y"]] for p in geometry["points"]])
+    nearest = np.stack([np.zeros(len(points)), np.clip(points[:, 1], -0.1, 0.1)], axis=1)
+    np.testing.assert_allclose(np.linalg.norm(points - nearest, axis=1), 0.07, atol=1e-12)
+    assert (np.diff(points[:, 1]) > 0).all()  # no fold, and normals that point outwards
+
+
+def test_colors_follow_mujoco_s_rule(model):
+    assert color(model, model.geom("chest").id) == pytest.approx((0.2, 0.6, 0.9, 1.0))
+    assert color(model, model.geom("head").id) == pytest.approx((0.9, 0.4, 0.4, 0.7))
+    assert color(model, model.geom("post").id) == pytest.approx((0.5, 0.5, 0.5, 1.0))
+
+
+def test_the_same_recording_is_the_same_page(model, recording):
+    again = record(model, *tumble(model)[::2], trails=["tip"], title="Tumble")
+    assert again.html() == recording.html()
+    assert scene_id(again) == scene_id(recording)
+    other = record(model, *tumble(model, seed=1)[::2], trails=["tip"], title="Tumble")
+    assert scene_id(other) != scene_id(recording)
+
+
+def test_page_loads_nothing_and_says_so(recording):
+    html = recording.html()
+    own = html[: html.index("<script>")]
+    assert "default-src 'none'" in own
+    assert "connect-src" not in own
+    assert not re.search(r"<(script|link|iframe|img|object|embed)[^>]*(src|href|data)=", html)
+    assert html.count("</script>") == 3
+    assert "@@" not in re.sub(r"<script>.*?</script>", "", html, flags=re.S)
+
+
+def test_a_hostile_title_or_name_stays_text(model):
+    qpos, _, times = tumble(model, frames=2)
+    name = "</script><script>alert(1)</script>"
+    html = record(model, qpos, times, title=name, readouts={name: [0.0, 1.0]}).html()
+    assert html.count("</script>") == 3
+    assert "<script>alert" not in html
+
+
+def test_twenty_seconds_of_a_humanoid_s_worth_of_bodies_stay_below_three_megabytes():
+    bodies = "".join(
+        f'<body name="b{i}" pos="{i} 0 0"><joint/><geom type="capsule" size=".1 .2"/></body>'
+        for i in range(17)
+    )
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    qpos = np.random.default_rng(0).normal(size=(1001, model.nq))
+    recording = record(model, qpos, 0.02 * np.arange(1001), trails=["b1"])
+    assert len(recording.bodies) == 17
+    assert len(recording.html().encode()) < 3e6
+
+
+def test_packed_arrays_decode_to_the_recording(recording):
+    data = json.loads(json.dumps(scene_data(recording)))
+    poses = np.frombuffer(base64.b64decode(data["poses"]), "<f4")
+    assert np.array_equal(poses.reshape(recording.poses.shape), recording.poses)
+    assert np.array_equal(np.frombuffer(base64.b64decode(data["times"]), "<f8"), recording.times)
+
+
+def test_overlays_are_broadcast_and_checked(model):
+    qpos, _, times = tumble(model, frames=3)
+    path = np.array([[0, 0, 1], [np.nan] * 3, [0, 1, 1.0]])
+    made = record(
+        model, qpos, times,
+        markers={"goal": [0, 0, 1.0], "way": Marker("way", path, radius=0.01)},
+        arrows={"force": Arrow([0, 0, 1.0], np.ones((3, 3)), scale=0.1)},
+        readouts={"f": [1, 2, 3]},
+    )  # fmt: skip
+    goal, way, force = made.overlays
+    assert goal.points.shape == force.points.shape == force.vectors.shape == (3, 3)
+    assert way.radius == 0.01
+    assert force.name == "force"
+    for wrong in (
+        {"markers": {"goal": [0.0, 0.0]}},
+        {"arrows": {"force": Arrow([0, 0, 1.0], np.ones((2, 3)))}},
+        {"arrows": {"force": Arrow([0, 0, np.nan], np.ones((3, 3)))}},
+        {"readouts": {"f": [1.0, 2.0]}},
+        {"trails": ["nowhere"]},
+    ):
+        with pytest.raises(ValueError, match=next(iter(next(iter(wrong.values()))))):
+            record(model, qpos, times, **wrong)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda q, t: (q[:, :-1], t), "states must have shape"),
+        (lambda q, t: (q[0], t), "states must have shape"),
+        (lambda q, t: (q, t[:-1]), "times must have shape"),
+        (lambda q, t: (q[:0], t[:0]), "one frame"),
+        (lambda q, t: (q, t[::-1]), "increase"),
+        (lambda q, t: (np.where(q == q[1, 0], np.nan, q), t), "finite"),
+    ],
+)
+def test_bad_trajectories_are_refused(model, change, message):
+    qpos, _, times = tumble(model, frames=3)
+    with pytest.raises(ValueError, match=message):
+        record(model, *change(qpos, times))
+
+
+def test_height_fields_are_refused_by_name():
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset><worldbody>'
+        '<geom name="hill" type="hfield" hfield="h"/></worldbody></mujoco>'
+    )
+    with pytest.raises(ValueError, match="hill is a mjGEOM_HFIELD"):
+        record(model, np.zeros((1, 0)), [0.0])
+
+
+def test_default_camera_frames_every_solid_geom(model, recording):
+    """Every geom's centre lies in the cone of the first preset."""
+    camera = next(iter(recording.cameras.values()))
+    data = mujoco.MjData(model)
+    data.qpos[:] = tumble(model)[0][0]
+    mujoco.mj_forward(model, data)
+    axis = np.subtract(camera.target, camera.position)
+    axis /= np.linalg.norm(axis)
+    solid = [g for g in range(model.ngeom) if model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE]
+    ray = data.geom_xpos[solid] - camera.position
+    angle = np.degrees(np.arccos(ray @ axis / np.linalg.norm(ray, axis=1)))
+    assert angle.max() < FIELD_OF_VIEW / 2
+    assert angle.max() > FIELD_OF_VIEW / 16  # and the scene is not a dot
+    for bad in (lambda: around([0, 0], 1.0), lambda: around([0, 0, 0], 0.0)):
+        with pytest.raises(ValueError, match=r"center|radius"):
+            bad()
+    assert around([1, 2, 3], 1.0, azimuth=0, elevation=0).position[1:] == pytest.approx((2, 3))
+
+
+def test_shown_in_a_notebook_as_a_frame_on_the_file(recording, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shown = []
+    monkeypatch.setattr(notebook, "display", shown.append)
+    box = recording.show("playback/tumble.html", height=300)
+    slider, link = box.children
+    markup = shown[0]._repr_html_()
+    assert 'src="playback/tumble.html"' in markup
+    assert "srcdoc" not in markup
+    assert (tmp_path / "playback/tumble.html").stat().st_size > 800_000
+    assert link.scene == scene_id(recording)
+    assert slider.max == pytest.approx(0.78)
+    assert slider.step == pytest.approx(0.02)
+    for path in (tmp_path / "x.html", "../x.html"):
+        with pytest.raises(ValueError, match="relative"):
+            recording.show(path)
+
+
+def test_own_cameras_replace_the_presets(model):
+    qpos, _, times = tumble(model, frames=2)
+    mine = {"mine": Camera((1, 0, 0), (0, 0, 0))}
+    assert record(model, qpos, times, cameras=mine).cameras == mine
+
+
+# ---- live view -------------------------------------------------------------------------------
+
+
+def refused(port, host="127.0.0.1"):
+    with socket.socket() as probe:
+        probe.settimeout(1.0)
+        return probe.connect_ex((host, port)) != 0
+
+
+async def follow(url, count, act):
+    """Connect as a browser does, read the scene, act, read `count` more messages."""
+    client = await websocket_connect(url.replace("http", "ws") + "socket")
+    received = []
+    while not received or received[-1]["path"] != "/meshcat/last":
+        received.append(umsgpack.unpackb(await asyncio.wait_for(client.read_message(), 5)))
+    act()
+    fresh = [
+        umsgpack.unpackb(await asyncio.wait_for(client.read_message(), 5)) for _ in range(count)
+    ]
+    client.close()
+    return received, fresh
+
+
+def test_live_view_serves_drives_and_leaves_nothing(model):
+    qpos, _, times = tumble(model, frames=1)
+    before = set(threading.enumerate())
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos[0]
+    data.qpos[0] = 0.25
+    mujoco.mj_kinematics(model, data)
+    with record(model, qpos, times).serve(timeout=30) as live:
+        with urllib.request.urlopen(live.url, timeout=5) as answer:
+            assert b"cmcPlayback" in answer.read()
+        live.visualizer["last"].set_property("visible", True)  # marks the end of the scene
+        scene, fresh = asyncio.run(follow(live.url, 4, lambda: live.update(data)))
+        assert {c["type"] for c in scene} == {"set_object", "set_transform", "set_property"}
+        moved = {c["path"]: np.reshape(c["matrix"], (4, 4)).T for c in fresh}
+        np.testing.assert_allclose(moved["/meshcat/torso"][:3, 3], data.body("torso").xpos)
+        assert refused(live.port, "127.0.0.2")  # a server on all interfaces would answer here
+    live.close()
+    assert live.closed
+    assert set(threading.enumerate()) <= before
+    assert refused(live.port)
+    with pytest.raises(RuntimeError, match="closed"):
+        live.update(data)
+
+
+def test_live_view_closes_itself(model):
+    qpos, _, times = tumble(model, frames=1)
+    live = record(model, qpos, times).serve(timeout=0.1)
+    deadline = time.monotonic() + 5
+    while not live.closed and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert live.closed
+    assert refused(live.port)
+    live.close()
+    with pytest.raises(ValueError, match="timeout"):
+        record(model, qpos, times).serve(timeout=0)
+
+
+def test_live_view_answers_no_foreign_host_or_origin(model):
+    qpos, _, times = tumble(model, frames=1)
+    with record(model, qpos, times).serve(timeout=30) as live:
+        request = urllib.request.Request(live.url, headers={"Host": "evil.example"})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(request, timeout=5)
+        foreign = HTTPRequest(
+            live.url.replace("http", "ws") + "socket", headers={"Origin": "http://evil.example"}
+        )
+
+        async def knock():
+            await websocket_connect(foreign)
+
+        with pytest.raises(HTTPClientError, match="403"):
+            asyncio.run(knock())
