@@ -113,10 +113,12 @@ class BatchedController:
         """Joint torques (N, 7) that realise tip accelerations (N, 6)."""
         law, jac, velocity = self.law, self.jac, self._qvel
         qn = law.posture_stiffness * (self._posture - self._qpos) - law.posture_damping * velocity
-        r = reference - self._drift() - (jac @ qn[..., None])[..., 0]
+        r = reference - self._drift()
+        disturbed = (jac @ qn[..., None])[..., 0]  # what the posture would do to the tip
         mass = self._mass()
         transposed = jac.swapaxes(1, 2)
         if law.form == "acceleration":
+            r = r - disturbed
             qn = qn + (transposed @ self._solve(jac @ transposed, r)[..., None])[..., 0]
             task = np.zeros_like(qn)
         else:
@@ -126,9 +128,9 @@ class BatchedController:
             if law.split:
                 force = np.concatenate(
                     [self._solve(inverse[:, b, b], r[:, b]) for b in (slice(3), slice(3, 6))], -1
-                )
+                ) - self._solve(inverse, disturbed)
             else:
-                force = self._solve(inverse, r)
+                force = self._solve(inverse, r - disturbed)
             task = (transposed @ force[..., None])[..., 0]
         # tau_task_space_control, or Nakanishi 3.3
         tau = task + (mass[:, :JOINTS, :JOINTS] @ qn[..., None])[..., 0]

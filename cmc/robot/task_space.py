@@ -81,7 +81,8 @@ class ControlLaw:
     Attributes:
         form: acceleration- or force-based.
         split: separate 3x3 blocks for translation and rotation instead of one 6x6 (force form).
-            The 6x6 couples a contact force into rotation and tilts the peg.
+            The 6x6 turns a contact force into a tilt of the peg; split blocks do not, but in
+            free space they only approximate x'' = x_r''.
         error_limit: the translation error is shortened to this length, m; None for no limit.
         posture: joint angles the null space returns to, rad.
         posture_stiffness: 1/s^2.
@@ -208,8 +209,9 @@ class TaskSpaceController:
         qn -= law.posture_damping * velocity
         mujoco.mj_jacDot(model, data, self._dotp, self._dotr, self.position, self._body)
         r = reference - self._jacdot_arm @ velocity
-        r -= jac @ qn
+        disturbed = jac @ qn  # what the posture would do to the tip
         if law.form == "acceleration":
+            r -= disturbed
             qn += jac.T @ self._solve(jac @ jac.T, r)
             mujoco.mj_mulM(model, data, self._mqn, self._qn)
             tau = self._mqn[:JOINTS] + data.qfrc_bias[:JOINTS]  # tau_task_space_control
@@ -219,9 +221,11 @@ class TaskSpaceController:
             inverse = self._solved @ self._full.T  # J M^-1 J^T
             tau = self._mqn[:JOINTS] + data.qfrc_bias[:JOINTS]
             if law.split:
+                tau -= self._solve(inverse.copy(), disturbed) @ jac
                 tau += self._solve(inverse[:3, :3].copy(), r[:3]) @ jac[:3]
                 tau += self._solve(inverse[3:, 3:].copy(), r[3:]) @ jac[3:]
             else:
+                r -= disturbed
                 tau += self._solve(inverse, r) @ jac  # Nakanishi 3.3
         tau -= data.qfrc_passive[:JOINTS]  # joint damping is compensated
         return tau

@@ -1,0 +1,299 @@
+"""Task-space control: exact in free space, predicted by its gains, chattering where it should."""
+
+import mujoco
+import numpy as np
+import pytest
+from mujoco.batch import Batch
+
+from cmc.robot import panda
+from cmc.robot.batched import BatchedController, rotation_vector
+from cmc.robot.task_space import (
+    MAZE_GAINS,
+    PUSH_GAINS,
+    ControlLaw,
+    Gains,
+    TaskSpaceController,
+)
+
+TIP = np.array([0.42, -0.02, 0.01])
+STILL = np.zeros(6)
+
+
+@pytest.fixture(scope="module")
+def start():
+    return panda.inverse_kinematics(TIP)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return panda.load_scene()
+
+
+def site_acceleration(model, data, site):
+    """J q'' + (dJ/dt) q' with dJ/dt by central differences along the motion."""
+
+    def jacobian(q):
+        other = mujoco.MjData(model)
+        other.qpos[:] = q
+        mujoco.mj_kinematics(model, other)
+        mujoco.mj_comPos(model, other)
+        jac = np.zeros((6, model.nv))
+        mujoco.mj_jacSite(model, other, jac[:3], jac[3:], site)
+        return jac
+
+    step = 1e-4
+    ahead, behind = (jacobian(data.qpos + s * step * data.qvel) for s in (1, -1))
+    return jacobian(data.qpos) @ data.qacc + (ahead - behind) / (2 * step) @ data.qvel
+
+
+@pytest.mark.parametrize("form", ["acceleration", "force"])
+def test_free_space_acceleration_is_the_reference(model, start, form):
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    for speed, tolerance in ((0.0, 1e-9), (0.3, 1e-7)):
+        controller = TaskSpaceController(model, MAZE_GAINS, ControlLaw(form))
+        for _ in range(20):
+            data.qpos[:] = start + rng.normal(0, 0.1, 7)
+            data.qvel[:] = rng.normal(0, 1, 7) * speed
+            mujoco.mj_forward(model, data)
+            reference = rng.normal(size=6)
+            controller.observe(data)
+            data.ctrl[:] = controller.torque_for(data, reference)
+            mujoco.mj_forward(model, data)
+            found = site_acceleration(model, data, controller.site)
+            np.testing.assert_allclose(found, reference, atol=tolerance)
+
+
+@pytest.mark.parametrize("form", ["acceleration", "force"])
+def test_the_moving_reference_is_exact_against_mujocos_own_acceleration(model, start, form):
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(1)
+    controller = TaskSpaceController(model, MAZE_GAINS, ControlLaw(form))
+    for _ in range(20):
+        data.qpos[:], data.qvel[:] = start + rng.normal(0, 0.1, 7), rng.normal(0, 1, 7)
+        mujoco.mj_forward(model, data)
+        reference = rng.normal(size=6)
+        controller.observe(data)
+        data.ctrl[:] = controller.torque_for(data, reference)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_rnePostConstraint(model, data)
+        object_acc = np.zeros(6)
+        kind = mujoco.mjtObj.mjOBJ_SITE
+        mujoco.mj_objectAcceleration(model, data, kind, controller.site, object_acc, 0)
+        np.testing.assert_allclose(object_acc[:3], reference[3:], atol=1e-9)
+        np.testing.assert_allclose(object_acc[3:] - [0, 0, 9.81], reference[:3], atol=1e-9)
+
+
+def test_without_posture_the_null_space_drifts_and_the_tip_does_not_care(model, start):
+    """The same tip motion, but the free elbow keeps swinging unless the posture holds it."""
+    speeds, tips = [], []
+    for stiffness, damping in ((1.0, 2.0), (0.0, 0.0)):
+        law = ControlLaw("force", posture_stiffness=stiffness, posture_damping=damping)
+        controller = TaskSpaceController(model, MAZE_GAINS, law)
+        data = mujoco.MjData(model)
+        data.qpos[:] = start
+        mujoco.mj_forward(model, data)
+        controller.observe(data)
+        swing = np.linalg.svd(controller.jac)[2][-1]  # the joint motion that leaves the tip alone
+        data.qvel[:] = 0.3 * swing
+        for _ in range(500):
+            mujoco.mj_step1(model, data)
+            data.ctrl[:] = controller.torque(data, TIP, panda.DOWN, STILL)
+            mujoco.mj_step2(model, data)
+        speeds.append(np.linalg.norm(data.qvel))
+        tips.append(np.linalg.norm(data.site("tip").xpos - TIP))
+    assert speeds[0] < 0.1 * 0.3
+    assert speeds[1] > 0.5 * 0.3
+    assert max(tips) < 5e-4
+
+
+def drive(model, start, gains, law, u_of, seconds, dt=0.02, offset=(0.005, 0, 0, 0, 0, 0)):
+    """Errors e and y at each tick of `dt` with torques held, from rest with an initial error."""
+    controller, data = TaskSpaceController(model, gains, law), mujoco.MjData(model)
+    target = TIP + np.array(offset[:3])
+    quat = np.empty(4)
+    angle = np.linalg.norm(offset[3:])
+    axis = np.array(offset[3:]) / (angle or 1.0)
+    mujoco.mju_axisAngle2Quat(quat, axis, angle)
+    turned = np.empty(4)
+    mujoco.mju_mulQuat(turned, quat, panda.DOWN)
+    data.qpos[:] = start
+    mujoco.mj_forward(model, data)
+    substeps = round(dt / model.opt.timestep)
+    errors, latents = [], []
+    for _ in range(round(seconds / dt)):
+        controller.observe(data)
+        error = controller.error(target, turned)
+        latent = gains.latent.y(error, -controller.velocity)
+        errors.append(error)
+        latents.append(latent)
+        data.ctrl[:] = controller.torque_from(data, error, u_of(latent))
+        mujoco.mj_step(model, data, substeps)
+        mujoco.mj_forward(model, data)
+    return np.array(errors), np.array(latents)
+
+
+@pytest.mark.parametrize("gains", [MAZE_GAINS, PUSH_GAINS])
+@pytest.mark.parametrize("form", ["acceleration", "force"])
+def test_the_latent_model_of_the_gains_predicts_the_arm(model, start, gains, form):
+    """A y' + B y + u = 0, with A and B from the gains alone, against the simulated y(t)."""
+    slope, seconds = 3.0, 0.4
+    offset = (0.003, -0.002, 0.002, 0.02, -0.03, 0.04)
+    _, found = drive(
+        model, start, gains, ControlLaw(form), lambda y: slope * y, seconds, 0.002, offset
+    )
+    kp, kd = gains.kp, gains.kd  # appendix D, written out independently
+    k2 = (kd - np.sqrt(kd**2 - 4 * kp)) / 2
+    rate = k2 * (1 + slope)  # y' = -(B + g) / A y with B = 1, A = 1 / K2
+    times = 0.002 * np.arange(len(found))
+    predicted = found[0] * np.exp(-np.outer(times, rate))
+    np.testing.assert_allclose(found, predicted, atol=0.02 * np.abs(found[0]).max(axis=-1))
+
+
+@pytest.mark.parametrize("form", ["acceleration", "force"])
+def test_a_held_torque_at_50_hz_tracks_like_the_ideal_equation(model, start, form):
+    errors, _ = drive(model, start, MAZE_GAINS, ControlLaw(form), lambda y: STILL, 0.42)
+    left = errors[20, 0] / 0.005
+    fast, slow = (-(20 + s * np.sqrt(240)) / 2 for s in (1, -1))
+    ideal = (slow * np.exp(fast * 0.4) - fast * np.exp(slow * 0.4)) / (slow - fast)
+    assert left == pytest.approx(ideal, abs=0.02)
+    assert np.abs(errors[:, [1, 2]]).max() < 2e-5
+    assert np.abs(errors[:, 3:]).max() < 2e-3
+
+
+@pytest.mark.parametrize("gains", [MAZE_GAINS, PUSH_GAINS])
+def test_chatter_starts_where_the_sampled_bound_says(model, start, gains):
+    """(K_d + g K2) dt < 2: decay just below, growing alternation just above."""
+
+    def moves(margin):
+        slope = (margin / 0.02 - gains.kd) / gains.latent.K2
+        slope[3:] = 0.0
+        law = ControlLaw("acceleration")
+        errors, _ = drive(
+            model, start, gains, law, lambda y: slope * y, 1.2, offset=(0.0005, 0, 0, 0, 0, 0)
+        )
+        return np.diff(errors[:, 0])
+
+    calm, wild = moves(1.9), moves(2.1)
+    assert np.abs(calm[-5:]).max() < 1e-6
+    assert np.abs(wild[-5:]).max() > 5e-4  # as large as the initial error, until torques saturate
+    growth = wild[9:20] / wild[8:19]
+    assert (growth < -1.0).all()  # alternates at half the sampling rate, and grows
+
+
+def test_control_at_every_physics_step_follows_the_same_path(model, start):
+    held, _ = drive(model, start, MAZE_GAINS, ControlLaw(), lambda y: STILL, 0.4, 0.02)
+    dense, _ = drive(model, start, MAZE_GAINS, ControlLaw(), lambda y: STILL, 0.4, 0.002)
+    np.testing.assert_allclose(held[:, 0], dense[::10, 0], atol=1e-4)
+
+
+def test_orientation_error_is_the_rotation_vector(model, start):
+    """Log map: a target turned by 0.7 rad gives an error of 0.7, not sin(0.35)."""
+    controller, data = TaskSpaceController(model, MAZE_GAINS), mujoco.MjData(model)
+    data.qpos[:] = start
+    mujoco.mj_forward(model, data)
+    controller.observe(data)
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        vector = rng.normal(size=3)
+        vector *= rng.uniform(0, 3.0) / np.linalg.norm(vector)
+        turn, quat = np.empty(4), np.empty(4)
+        angle = np.linalg.norm(vector)
+        mujoco.mju_axisAngle2Quat(turn, vector / angle, angle)
+        mujoco.mju_mulQuat(quat, turn, panda.DOWN)
+        for sign in (1, -1):  # q and -q are one orientation
+            np.testing.assert_allclose(controller.error(TIP, sign * quat)[3:], vector, atol=1e-7)
+            np.testing.assert_allclose(rotation_vector(sign * turn), vector, atol=1e-9)
+
+
+LAWS = [
+    ControlLaw("acceleration"),
+    ControlLaw("force"),
+    ControlLaw("force", split=True, error_limit=0.005),
+]
+
+
+@pytest.mark.parametrize("law", LAWS, ids=["acceleration", "force", "split"])
+@pytest.mark.parametrize("stiffness", [0.0, 200.0])
+def test_many_worlds_get_the_torques_of_one(start, law, stiffness):
+    model = panda.load_scene(peg=panda.Peg(stiffness=stiffness))
+    count, rng = 8, np.random.default_rng(3)
+    batch = Batch(model, count, nthread=1, persistent=True)
+    many = BatchedController(model, batch, MAZE_GAINS, law)
+    qpos, qvel = batch.bind("qpos"), batch.bind("qvel")
+    qpos[:, :7] = start + rng.normal(0, 0.4, (count, 7))
+    qpos[0, :7] = 0.0  # singular
+    qvel[:] = rng.normal(0, 0.5, qvel.shape)
+    batch.forward()
+    target, u = TIP + rng.normal(0, 0.02, (count, 3)), rng.normal(size=(count, 6))
+    many.observe()
+    found = many.torque_from(many.error(target, np.tile(panda.DOWN, (count, 1))), u)
+    one, data = TaskSpaceController(model, MAZE_GAINS, law), mujoco.MjData(model)
+    for k in range(count):
+        data.qpos[:], data.qvel[:] = qpos[k], qvel[k]
+        mujoco.mj_forward(model, data)
+        single = one.torque(data, target[k], panda.DOWN, u[k])
+        np.testing.assert_allclose(found[k], single, rtol=1e-9, atol=1e-9)
+
+
+def test_singular_poses_give_bounded_torques(model):
+    """The stretched arm (q = 0) has no six-dimensional task space; the solve is damped."""
+    for law in LAWS:
+        controller, data = TaskSpaceController(model, MAZE_GAINS, law), mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        assert np.linalg.cond(controller_jacobian(controller, data)) > 1e6
+        torque = controller.torque(data, TIP, panda.DOWN, STILL)
+        assert np.isfinite(torque).all()
+        for _ in range(500):
+            mujoco.mj_step1(model, data)
+            data.ctrl[:] = controller.torque(data, TIP, panda.DOWN, STILL)
+            mujoco.mj_step2(model, data)
+        assert np.isfinite(data.qpos).all()
+        assert data.qpos[3] < 0.05  # stays at or returns inside joint 4's range
+
+
+def controller_jacobian(controller, data):
+    controller.observe(data)
+    return controller.jac
+
+
+def test_split_blocks_keep_a_pressing_peg_upright():
+    """A sideways contact force turns the hand through the 6x6 and hardly at all when split."""
+    tilts = {}
+    model = panda.load_scene()
+    start = panda.inverse_kinematics(TIP)
+    for split in (False, True):
+        law = ControlLaw("force", split=split)
+        controller, data = TaskSpaceController(model, MAZE_GAINS, law), mujoco.MjData(model)
+        data.qpos[:] = start
+        mujoco.mj_forward(model, data)
+        for _ in range(1000):
+            mujoco.mj_step1(model, data)
+            data.qfrc_applied[:] = 0
+            point = data.site("tip").xpos
+            body = model.body("peg").id
+            mujoco.mj_applyFT(
+                model, data, np.array([0, 3.0, 0]), np.zeros(3), point, body, data.qfrc_applied
+            )
+            data.ctrl[:] = controller.torque(data, TIP, panda.DOWN, STILL)
+            mujoco.mj_step2(model, data)
+        controller.observe(data)
+        tilts[split] = np.linalg.norm(controller.error(TIP, panda.DOWN)[3:])
+    assert tilts[True] < 0.1 * tilts[False]
+
+
+def test_bad_gains_and_laws_are_refused(model):
+    with pytest.raises(ValueError, match="4"):
+        Gains(kp_trans=40, kd_trans=10, kp_rot=20, kd_rot=10)
+    with pytest.raises(ValueError, match="finite|at least"):
+        Gains(kp_trans=np.nan, kd_trans=10, kp_rot=20, kd_rot=10)
+    with pytest.raises(ValueError, match="form"):
+        ControlLaw("velocity")
+    with pytest.raises(ValueError, match="split"):
+        ControlLaw("acceleration", split=True)
+    with pytest.raises(ValueError, match="error_limit"):
+        ControlLaw(error_limit=-1.0)
+    with pytest.raises(ValueError, match="posture"):
+        ControlLaw(posture=(0.0, 1.0))
+    with pytest.raises(ValueError, match="no site"):
+        TaskSpaceController(model, MAZE_GAINS, site="elbow")
