@@ -3,6 +3,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_continuous_lyapunov
 
+from cmc.theory.certificates import circle_criterion
 from cmc.theory.contraction import contraction_factor, contraction_rate
 from cmc.theory.disturbance import (
     KINDS,
@@ -42,20 +43,10 @@ def tanh_loop(c, low, high):
     return rhs
 
 
-def ball_of_slopes(c, low, high):
-    """Best metric [[1, s], [s, r]] for J = [[-c, -k], [1, 0]], k in [low, high], by a grid."""
-    s, r = np.meshgrid(np.linspace(0.05, 1.0, 60) * c, np.linspace(0.2, 3.0, 60) * high)
-    s, r = s[s**2 < 0.98 * r], r[s**2 < 0.98 * r]
-    metrics = np.stack([np.stack([np.ones_like(s), s], -1), np.stack([s, r], -1)], -2)
-    rates = [contraction_rate(np.array([[-c, -k], [1.0, 0.0]]), metrics) for k in (low, high)]
-    worst = np.min(rates, axis=0)
-    return ErrorBall(metrics[worst.argmax()], float(worst.max()), PUSH)
-
-
 def test_bound_contains_all_of_ten_thousand_disturbed_nonlinear_trajectories():
     rng, size = np.random.default_rng(0), 0.7
     times = np.linspace(0.0, 8.0, 321)
-    rhs, ball = tanh_loop(2.0, 0.8, 2.4), ball_of_slopes(2.0, 0.8, 2.4)
+    rhs, ball = tanh_loop(2.0, 0.8, 2.4), ErrorBall.of(circle_criterion(2.0, 0.8, 2.4), PUSH)
     d = random_disturbances(rng, 320, 10_000, size, step=0.025)
     first, second = rng.normal(size=(2, 10_000, 2))
     second[:5000] = first[:5000]  # half of the pairs start together
@@ -212,3 +203,16 @@ def test_unstable_loops_and_wrong_sizes_are_refused():
         respond(lambda t, s: -s, np.zeros((1, 2)), [0.0, 1.0, 2.0], np.zeros((3, 1, 2)))
     with pytest.raises(ValueError, match="steps, batch"):
         random_disturbances(np.random.default_rng(0), 0, 1, 1.0, step=0.1)
+
+
+def test_ball_of_a_certificate_takes_its_metric_and_its_rate():
+    found = circle_criterion(2.0, 0.8, 2.4)
+    ball = ErrorBall.of(found, PUSH)
+    np.testing.assert_allclose(ball.metric, found.metric)
+    assert ball.rate == found.rate > 0
+    with pytest.raises(ValueError, match="without a certificate"):
+        ErrorBall.of(circle_criterion(0.1, 0.8, 2.4))
+    with pytest.raises(ValueError, match="frozen"):
+        ErrorBall.of(circle_criterion(2.0, 0.8, 2.4, kind="frozen"))
+    with pytest.raises(ValueError, match="does not go with"):
+        ErrorBall.of(found, period=0.01)

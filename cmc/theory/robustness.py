@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cmc.theory.certificates import Certificate
 from cmc.theory.contraction import metric_factor
 from cmc.theory.simulate import rk4
 
@@ -62,6 +63,29 @@ class ErrorBall:
         object.__setattr__(self, "metric", metric)
         object.__setattr__(self, "channel", channel)
         object.__setattr__(self, "theta", theta)
+
+    @classmethod
+    def of(
+        cls, certificate: Certificate, channel: ArrayLike | None = None, period: float | None = None
+    ) -> ErrorBall:
+        """Ball of a certified loop.
+
+        Args:
+            certificate: one that holds and is exact: its metric and rate are used.
+            channel: B, (n, m).
+            period: control period in s, for a certificate of a sampled loop.
+
+        Raises:
+            ValueError: if nothing is proved, or the period does not go with the domain.
+        """
+        if not certificate.holds or certificate.metric is None:
+            raise ValueError(f"no error ball without a certificate: {certificate}")
+        if certificate.kind != "exact":
+            raise ValueError("a frozen certificate proves nothing about two real trajectories")
+        if (certificate.domain == "sampled") != (period is not None):
+            raise ValueError(f"domain {certificate.domain!r} does not go with period {period!r}")
+        pushed = None if channel is None else np.asarray(channel, float)
+        return cls(certificate.metric, certificate.rate, pushed, period)
 
     def distance(self, difference: ArrayLike) -> Array:
         """Length in the metric, ||Theta delta||, of differences (..., n)."""
