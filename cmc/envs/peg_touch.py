@@ -45,8 +45,9 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
     | 1   | a_2, vertical   | -3  | 3   | m    |
 
     The command is u = u0 + T_a a ("auxiliary") or u = u0 + a ("identity", "raw"), turned by
-    `mount_angle`, then clipped to `x_limits` and `z_limits`. Larger actions are accepted and
-    saturate in the same place; NaN and infinity are refused.
+    `mount_angle`, then clipped to `x_limits` and `z_limits`; with `stiffness_reference`, a_2 is
+    first divided by the relative stiffness. Larger actions are accepted and saturate in the same
+    place; NaN and infinity are refused.
 
     ## Observation space
 
@@ -85,8 +86,8 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
     ## Info
 
     - `reward_terms`: term to (num_envs,) array.
-    - `privileged`: (num_envs, 8) float32 for a critic in training: x, f, z, both targets, log
-      stiffness and both surface coefficients, each scaled to order one.
+    - `privileged`: (num_envs, 10) float32, all that a critic needs in training: both errors and
+      integrals, x, z, f_d, log stiffness and both surface coefficients, scaled to order one.
     - at truncation in same-step mode: `final_obs` and `final_info`, with the masks `_final_obs`
       and `_final_info`.
 
@@ -105,7 +106,7 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
-    privileged_size = 8
+    privileged_size = 10
 
     def __init__(
         self,
@@ -178,6 +179,9 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
         if not np.isfinite(a).all():
             raise ValueError("actions: wanted finite numbers, got NaN or infinity")
         c = self.config
+        if c.stiffness_reference is not None:
+            scale = c.stiffness_reference / self.sampled["K_sur"]
+            a = np.stack([a[:, 0], scale * a[:, 1]], axis=-1)
         if c.interface != "auxiliary" and c.mount_angle != 0.0:
             a = a @ self._mount.T  # in the auxiliary space T_a turns the command back
         low, high = zip(c.x_limits, c.z_limits, strict=True)
@@ -293,12 +297,14 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
         return np.stack(columns, axis=-1).astype(np.float32)
 
     def _privileged(self) -> NDArray[np.float32]:
-        s, (x, z) = self.sampled, self.position.T
+        s, (x, z), error = self.sampled, self.position.T, self.error
         scaled = [
+            error[:, 0],
+            np.clip(error[:, 1] / 3.0, -5.0, 5.0),
+            self.integral[:, 0],
+            np.clip(self.integral[:, 1], -5.0, 5.0),
             x - 2.0,
-            self.force / 10.0,
             z,
-            s["x_d"] - 2.0,
             s["f_d"] + 1.5,
             np.log(s["K_sur"]) - 2.5,
             100.0 * s["surface_sin"],

@@ -69,6 +69,9 @@ class PegTouchConfig:
     mount_angle: float = 0.0
     """Angle between the command axes and the plant's axes [rad]. Our extension: at 0 it is the
     paper's plant; elsewhere every entry of f_u is non-zero and T_a is the rotation back."""
+    stiffness_reference: float | None = None
+    """If given, a_2 is multiplied by this over the nominal stiffness [N/m]: R_22 is then the same
+    on every surface and a slope is a loop gain. Our extension; None is the paper's setting."""
     interface: str = "auxiliary"
     """What the policy sees and commands: one of `INTERFACES` (see `PegTouchVectorEnv`)."""
     shift: PegShift = field(default_factory=PegShift)
@@ -85,6 +88,11 @@ class PegTouchConfig:
                 raise ValueError(f"{name}: wanted a positive number, got {getattr(self, name)}")
         if self.K_sur[0] <= 0.0:
             raise ValueError(f"K_sur: wanted positive stiffnesses, got {self.K_sur}")
+        if self.stiffness_reference is not None and not self.stiffness_reference > 0.0:
+            raise ValueError(
+                f"stiffness_reference: wanted None or a positive number, "
+                f"got {self.stiffness_reference}"
+            )
         if self.horizon < 1:
             raise ValueError(f"horizon: wanted at least 1 step, got {self.horizon}")
         if self.interface not in INTERFACES:
