@@ -1,0 +1,265 @@
+"""The playback page in a real browser, from disk and with the network off."""
+
+import base64
+import io
+import json
+import time
+
+import mujoco
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from test_view_playback import SCENE, tumble
+
+from cmc.view.playback import Arrow, Marker, notebook, record
+
+pytestmark = pytest.mark.browser
+
+MATRIX = """(path) => {
+  const scene = cmcPlayback.viewer.scene;
+  scene.updateMatrixWorld(true);
+  const world = cmcPlayback.viewer.scene_tree.find(path).object.matrixWorld.clone();
+  return scene.matrixWorld.clone().invert().multiply(world).toArray();
+}"""
+OVERLAY = """(name) => {
+  const found = cmcPlayback.viewer.scene.getObjectByName("overlay " + name);
+  return { visible: found.visible, position: found.position.toArray(),
+           quaternion: found.quaternion.toArray() };
+}"""
+
+
+@pytest.fixture(scope="module")
+def model():
+    return mujoco.MjModel.from_xml_string(SCENE)
+
+
+@pytest.fixture(scope="module")
+def recording(model):
+    qpos, _, times = tumble(model)
+    goal = np.tile([0.2, 0.1, 0.5], (40, 1))
+    goal[30:] = np.nan
+    force = np.zeros((40, 3))
+    force[10:, 1] = 2.0
+    return record(
+        model,
+        qpos,
+        times + 3.0,  # a recording need not start at zero
+        title="Tumble",
+        trails=["tip"],
+        markers={"goal": Marker("goal", goal, radius=0.02)},
+        arrows={"force": Arrow([0.1, 0.2, 0.3], force, scale=0.1)},
+        readouts={"height [m]": qpos[:, 2]},
+    )
+
+
+@pytest.fixture(scope="module")
+def page(browser, recording, tmp_path_factory):
+    path = recording.save(tmp_path_factory.mktemp("page") / "tumble.html")
+    context = browser.new_context(offline=True, viewport={"width": 640, "height": 420})
+    page = context.new_page()
+    page.asked, page.failed = [], []
+    page.on("request", lambda request: page.asked.append(request.url))
+    page.on("pageerror", lambda error: page.failed.append(str(error)))
+    page.on("console", lambda line: line.type == "error" and page.failed.append(line.text))
+    page.goto(path.as_uri())
+    until(page, "window.cmcPlayback")
+    yield page
+    context.close()
+
+
+def until(frame, expression, seconds=10.0):
+    """Wait for an expression; Playwright's own waiting needs eval, which the page forbids."""
+    deadline = time.monotonic() + seconds
+    while not frame.evaluate(f"Boolean({expression})"):
+        assert time.monotonic() < deadline, f"never true: {expression}"
+        frame.wait_for_timeout(20)
+
+
+def matrix(page, *path):
+    return np.reshape(page.evaluate(MATRIX, ["meshcat", *path]), (4, 4)).T
+
+
+def seek(page, seconds):
+    page.evaluate("(t) => cmcPlayback.seek(t)", seconds)
+
+
+def state(page):
+    return page.evaluate("cmcPlayback.state()")
+
+
+@pytest.mark.parametrize("frame", [0, 1, 13, 39])
+def test_world_matrices_in_the_page_equal_mujoco_s(page, model, recording, frame):
+    qpos, _, times = tumble(model)
+    seek(page, times[frame] - times[0])
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos[frame]
+    mujoco.mj_forward(model, data)
+    for body, name in enumerate(recording.bodies, start=1):
+        world = matrix(page, name)
+        np.testing.assert_allclose(world[:3, 3], data.xpos[body], atol=1e-5)
+        np.testing.assert_allclose(world[:3, :3], data.xmat[body].reshape(3, 3), atol=1e-5)
+    for name, y_axis in (("post", True), ("chest", True), ("hand", False), ("nail", False)):
+        geom = model.geom(name).id
+        body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, model.geom_bodyid[geom])
+        world = matrix(page, body or f"body{model.geom_bodyid[geom]}", f"geom{geom}", "<object>")
+        np.testing.assert_allclose(world[:3, 3], data.geom_xpos[geom], atol=1e-5)
+        z_axis = data.geom_xmat[geom].reshape(3, 3)[:, 2]
+        np.testing.assert_allclose(world[:3, 1 if y_axis else 2], z_axis, atol=1e-5)
+
+
+def test_between_frames_the_motion_is_interpolated(page, recording):
+    seek(page, 0.25 * 0.02)
+    a, b = recording.poses[0, 0, :3], recording.poses[1, 0, :3]
+    np.testing.assert_allclose(matrix(page, "torso")[:3, 3], 0.75 * a + 0.25 * b, atol=1e-6)
+    rotation = matrix(page, "torso")[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+
+
+def test_the_drawn_geometry_is_as_large_as_mujoco_s(page, model):
+    """Bounding boxes that three.js computes, for the shapes it builds itself."""
+    box = """(path) => {
+      const mesh = cmcPlayback.viewer.scene_tree.find(path).object;
+      mesh.geometry.computeBoundingBox();
+      const size = mesh.geometry.boundingBox.max.clone().sub(mesh.geometry.boundingBox.min);
+      return size.multiply(mesh.scale).toArray();
+    }"""
+    for name, axes in (("chest", [0, 2, 1]), ("bone", [0, 2, 1]), ("belly", [0, 1, 2])):
+        geom = model.geom(name).id
+        body = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, model.geom_bodyid[geom])
+        size = page.evaluate(box, ["meshcat", body, f"geom{geom}", "<object>"])
+        wanted = 2 * model.geom_aabb[geom, 3:]
+        np.testing.assert_allclose(np.array(size)[axes], wanted, rtol=5e-3)
+
+
+def test_nothing_was_asked_of_the_network_and_nothing_failed(page):
+    assert [url for url in page.asked if not url.startswith(("file:", "blob:", "data:"))] == []
+    assert len([url for url in page.asked if url.startswith("file:")]) == 1
+    assert page.failed == []
+
+
+def test_overlays_follow_the_time(page, recording):
+    seek(page, 0.1)
+    goal, force = page.evaluate(OVERLAY, "goal"), page.evaluate(OVERLAY, "force")
+    assert goal["visible"]
+    np.testing.assert_allclose(goal["position"], [0.2, 0.1, 0.5], atol=1e-6)
+    assert not force["visible"]
+    seek(page, 0.7)
+    goal, force = page.evaluate(OVERLAY, "goal"), page.evaluate(OVERLAY, "force")
+    assert not goal["visible"]
+    assert force["visible"]
+    np.testing.assert_allclose(force["quaternion"], [0, 0, 0, 1], atol=1e-6)  # +y is its axis
+    assert page.inner_text("#readouts").split()[-1] == f"{recording.readouts['height [m]'][35]:.3g}"
+
+
+def test_play_pause_keys_slider_and_speed(page):
+    seek(page, 0)
+    page.select_option("#speed", "0.25")
+    page.click("#play")
+    until(page, "cmcPlayback.state().time > 0.02")
+    page.click("#play")
+    assert not state(page)["playing"]
+    assert state(page)["speed"] == 0.25
+    page.keyboard.press("ArrowRight")
+    stopped = state(page)["time"]
+    page.keyboard.press("ArrowLeft")
+    assert stopped - state(page)["time"] == pytest.approx(0.02, abs=1e-9)
+    page.fill("#time", "0.5")
+    assert state(page)["time"] == pytest.approx(0.5)
+    page.keyboard.press("Space")
+    assert state(page)["playing"]
+    page.select_option("#speed", "4")
+    until(page, "!cmcPlayback.state().playing")  # it stops at the end
+    assert state(page)["time"] == pytest.approx(0.78)
+
+
+def test_camera_presets_change_the_view_and_follow(page, recording):
+    seek(page, 0)
+    names = list(recording.cameras)
+    where = "cmcPlayback.viewer.camera.position.toArray()"
+    for index, name in enumerate(names):
+        page.get_by_role("button", name=name, exact=True).click()
+        x, y, z = recording.cameras[name].position
+        np.testing.assert_allclose(page.evaluate(where), [x, z, -y], atol=1e-6)
+        page.keyboard.press(str(index + 1))
+    before = np.array(page.evaluate(where))
+    seek(page, 0.4)
+    step = recording.overlays[0].points[20] - recording.overlays[0].points[0]
+    moved = np.array(page.evaluate(where)) - before
+    np.testing.assert_allclose(moved, [step[0], step[2], -step[1]], atol=1e-5)
+    page.keyboard.press("1")
+
+
+def picture(page):
+    return imread(io.BytesIO(page.screenshot()))[:, :, :3]
+
+
+def test_the_scene_is_drawn_and_moves(page):
+    page.keyboard.press("1")
+    seek(page, 0)
+    page.wait_for_timeout(300)
+    first = picture(page)
+    seek(page, 0.7)
+    page.wait_for_timeout(300)
+    second = picture(page)
+    assert first.std() > 0.03  # not an empty canvas
+    assert (np.abs(first - second).max(axis=2) > 0.1).mean() > 0.005
+    assert first[5, -5].min() > 0.7  # a light background, even above a grey floor
+
+
+def test_a_slider_beside_the_frame_scrubs_it_without_a_kernel(browser, recording, tmp_path):
+    """The widget's own JavaScript, with a stand-in for the notebook's model, in a parent page."""
+    recording.save(tmp_path / "scene.html")
+    source = base64.b64encode(notebook.LINK_SOURCE.encode()).decode()
+    (tmp_path / "notebook.html").write_text(f"""<!DOCTYPE html>
+      <iframe src="scene.html" sandbox="allow-scripts" width="300" height="200"></iframe>
+      <script type="module">
+        const state = {json.dumps({"scene": notebook.scene_id(recording), "value": 0})};
+        const heard = [];
+        const model = {{ get: (key) => state[key], on: (event, act) => heard.push(act) }};
+        const widget = (await import("data:text/javascript;base64,{source}")).default;
+        widget.initialize({{ model }});
+        window.move = (value) => {{ state.value = value; heard.forEach((act) => act()); }};
+      </script>""")
+    page = browser.new_context(offline=True).new_page()
+    page.goto((tmp_path / "notebook.html").as_uri())
+    until(page, "window.move")
+    frame = page.frames[1]
+    until(frame, "window.cmcPlayback")
+    page.evaluate("move(0.5)")
+    until(frame, "cmcPlayback.state().time === 0.5")
+    page.evaluate(
+        "document.querySelector('iframe').contentWindow"
+        ".postMessage({ cmcPlayback: 'another', seek: 0.1 }, '*')"
+    )
+    page.evaluate("move(0.6)")
+    until(frame, "cmcPlayback.state().time === 0.6")
+    page.context.close()
+
+
+def test_live_view_moves_a_body_in_the_browser(browser, model):
+    qpos, _, times = tumble(model, frames=1)
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos[0]
+    with record(model, qpos, times).serve(timeout=60) as live:
+        page = browser.new_context().new_page()
+        page.goto(live.url)
+        until(page, "window.cmcPlayback")
+        data.qpos[0] = 0.375
+        mujoco.mj_kinematics(model, data)
+        live.update(data)
+        until(
+            page,
+            "cmcPlayback.viewer.scene_tree.find(['meshcat', 'torso']).object.position.x === 0.375",
+        )
+        assert page.evaluate("cmcPlayback.viewer.scene_tree.find(['meshcat', 'torso', 'geom5',"
+                             " '<object>']).object.isMesh")  # fmt: skip
+        page.context.close()
+
+
+def test_a_browser_without_webgl_says_so(browser, recording, tmp_path):
+    path = recording.save(tmp_path / "scene.html")
+    page = browser.new_context(offline=True).new_page()
+    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null;")
+    page.goto(path.as_uri())
+    assert "needs WebGL" in page.inner_text("#failure")
+    page.context.close()
