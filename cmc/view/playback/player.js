@@ -36,7 +36,7 @@ for (const name of ["Grid", "Axes"]) viewer.set_property([name], "visible", fals
 for (const name of ["PointLightNegativeX", "PointLightPositiveX", "FillLight", "AmbientLight"]) {
   viewer.set_property(["Lights", name], "visible", false);
 }
-const sky = new THREE.HemisphereLight(0xffffff, 0xaeb6bf, 0.6);
+const sky = new THREE.HemisphereLight(0xffffff, 0xb4bcc4, 0.62);
 sky.position.set(0, 0, 1);
 const sun = new THREE.DirectionalLight(0xffffff, 0.4);
 sun.castShadow = true;
@@ -52,7 +52,7 @@ function aimLights() {
   const target = new THREE.Vector3(t.x, -t.z, t.y);
   const offset = new THREE.Vector3(eye.x - t.x, -(eye.z - t.z), eye.y - t.y).normalize();
   sun.target.position.copy(target);
-  sun.position.set(-0.9, -0.5, 1.9).add(target);
+  sun.position.set(0.35, -1.15, 1.9).add(target);
   fill.position.copy(target).add(offset);
   fill.target = sun.target;
   const box = sun.shadow.camera, half = reach * 0.8;

@@ -151,40 +151,51 @@ def record(
             and for trails that name no site or body.
     """
     time, rows, spec = _checked(model, states, times)
-    data = mujoco.MjData(model)
     drawn = drawn_bodies(model, groups)
     points = [_locator(model, name) for name in trails]
-    poses = np.empty((len(time), len(drawn), 7), dtype=np.float32)
-    tracks = np.empty((len(points), len(time), 3))
-    for k, row in enumerate(rows):
-        if spec is None:
-            data.qpos[:] = row
-        else:
-            mujoco.mj_setState(model, data, row, spec)
-        if mocap is not None:
-            data.mocap_pos[:], data.mocap_quat[:] = np.asarray(mocap[0])[k], np.asarray(mocap[1])[k]
-        mujoco.mj_kinematics(model, data)
-        if k == 0:
-            log = draw(model, data, groups)
-            geoms = [g for b in drawn for g in _visible_geoms(model, b, groups)]
-            ball = scene_ball(model, data, geoms)
-        poses[k, :, :3], poses[k, :, 3:] = data.xpos[drawn], data.xquat[drawn]
-        for i, (is_site, index) in enumerate(points):
-            tracks[i, k] = data.site_xpos[index] if is_site else data.xpos[index]
+    data = mujoco.MjData(model)
+    poses, sites = _replay(model, data, rows, spec, mocap)
+    tracks = {
+        name: sites[:, index] if is_site else poses[:, index, :3].astype(float)
+        for name, (is_site, index) in zip(trails, points, strict=True)
+    }
+    poses = poses[:, drawn]
     moving = np.flatnonzero(np.ptp(poses, axis=0).max(axis=-1) > 0.0)
-    shown = [trail(name, track) for name, track in zip(trails, tracks, strict=True)]
+    over = as_overlays(len(time), markers or {}, arrows or {})
     return Recording(
         title=title,
         times=time,
         bodies=tuple(body_path(model, drawn[i]) for i in moving),
         poses=np.ascontiguousarray(poses[:, moving]),
-        commands=tuple(log.commands),
-        overlays=(*shown, *as_overlays(len(time), markers or {}, arrows or {})),
+        commands=tuple(draw(model, data, groups).commands),
+        overlays=(*(trail(name, track) for name, track in tracks.items()), *over),
         readouts={name: _values(name, v, len(time)) for name, v in (readouts or {}).items()},
-        cameras=dict(cameras)
-        if cameras
-        else default_cameras(ball, dict(zip(trails, tracks, strict=True))),
+        cameras=dict(cameras or default_cameras(_ball(model, data, groups), tracks)),
     )
+
+
+def _replay(
+    model: mujoco.MjModel, data: mujoco.MjData, rows: Array, spec: int | None, mocap: Any
+) -> tuple[NDArray[np.float32], Array]:
+    """World poses (T, nbody, 7) and site positions (T, nsite, 3); `data` is left at frame 0."""
+    poses = np.empty((len(rows), model.nbody, 7), dtype=np.float32)
+    sites = np.empty((len(rows), model.nsite, 3))
+    qpos, xpos, xquat, site_xpos = data.qpos, data.xpos, data.xquat, data.site_xpos  # live views
+    for k in range(len(rows) - 1, -1, -1):
+        if spec is None:
+            qpos[:] = rows[k]
+        else:
+            mujoco.mj_setState(model, data, rows[k], spec)
+        if mocap is not None:
+            data.mocap_pos[:], data.mocap_quat[:] = mocap[0][k], mocap[1][k]
+        mujoco.mj_kinematics(model, data)
+        poses[k, :, :3], poses[k, :, 3:], sites[k] = xpos, xquat, site_xpos
+    return poses, sites
+
+
+def _ball(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[int]) -> tuple[Array, float]:
+    geoms = [g for b in range(model.nbody) for g in _visible_geoms(model, b, groups)]
+    return scene_ball(model, data, geoms)
 
 
 def _visible_geoms(model: mujoco.MjModel, body: int, groups: Sequence[int]) -> list[int]:
