@@ -26,10 +26,12 @@ class Plant(ABC):
         y_high: Upper end of the region of interest, (n,).
         u_low: Smallest admissible command, (n,).
         u_high: Largest admissible command, (n,).
+        constant: Whether f_y and f_u are the same everywhere, so that the transforms are as well.
     """
 
     name: ClassVar[str]
     n: int = 2
+    constant: ClassVar[bool] = False
     state_names: Sequence[str] = ("y1", "y2")
     units: Sequence[str] = ("1", "1")
     y_low: Array
@@ -60,7 +62,8 @@ class Plant(ABC):
         y = np.asarray(y, dtype=float)
         zero = np.zeros_like(y)
         drift = self.f(y, zero, t)
-        return -np.linalg.solve(self.f_u(y, zero, t), drift[..., None])[..., 0]
+        held = np.linalg.solve(self.f_u(y, zero, t), drift[..., None])[..., 0]
+        return -held.astype(np.float64)
 
     def _pair(self, y: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
         """Check the last axes and broadcast the batch axes of `y` and `u`."""

@@ -17,6 +17,7 @@ class LinearPlant(Plant):
     """
 
     name = "linear"
+    constant = True
 
     def __init__(self, A: ArrayLike, B: ArrayLike) -> None:
         self.A = finite_matrix("A", A)

@@ -1,0 +1,280 @@
+"""Certificates: what is proved about a loop, in which coordinates, and with which metric.
+
+In the coordinates (z, int z) the loop z' = Lambda z + R a, a = pi(z, int z) has the Jacobian
+
+    J = [[Lambda + R P, R Q], [I, 0]],    P = dpi/ds1, Q = dpi/ds2 (diagonal),
+
+without any derivative of P or Q: nothing is ignored. It is affine in the slopes, so one metric that
+works at the corners of their intervals works for every slope in between, constant or not. That is
+what the inequalities of theorem 2 (`eq_theorem2`) lack: they look at one frozen time after another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import block_diag
+
+from cmc.theory.contraction import contraction_factor, contraction_rate, metric_factor, overshoot
+from cmc.theory.metric_search import MetricSearch, search_metric
+
+Array = NDArray[np.float64]
+Kind = Literal["frozen", "exact"]
+Domain = Literal["continuous", "sampled"]
+
+# Settling for this share of the largest provable rate keeps the metric well conditioned.
+_SHARE = 0.9
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is guaranteed about a loop, or why nothing is.
+
+    Attributes:
+        holds: Whether contraction is proved.
+        kind: "exact" if the total Jacobian was used, "frozen" if the transforms were held constant,
+            which proves nothing about a loop whose transforms move with its state.
+        domain: "continuous", or "sampled" with a zero-order hold.
+        rate: Proved contraction rate, 1/s (NaN where nothing is proved).
+        metric: M of the distance that shrinks, (m, m), or None.
+        violated: The Jacobian (or step) that stands in the way, (m, m), or None.
+        region: Where it holds, in words.
+        reason: Why it holds, or does not, in words.
+        refused: Whether the question could not be asked at all.
+    """
+
+    holds: bool
+    kind: Kind
+    domain: Domain = "continuous"
+    rate: float = float("nan")
+    metric: Array | None = None
+    violated: Array | None = None
+    region: str = "everywhere"
+    reason: str = ""
+    refused: bool = False
+
+    def __bool__(self) -> bool:
+        return self.holds
+
+    @property
+    def overshoot(self) -> float:
+        """Bound sqrt(cond(M)) on the Euclidean transient; NaN where nothing is proved."""
+        return float("nan") if self.metric is None else float(overshoot(self.metric))
+
+    def __str__(self) -> str:
+        verdict = "refused" if self.refused else "contracting" if self.holds else "not proved"
+        line = f"{verdict} ({self.kind}, {self.domain}), {self.region}"
+        if self.holds:
+            line += f": rate {self.rate:.3g} 1/s, overshoot at most {self.overshoot:.3g}"
+        return f"{line}. {self.reason}" if self.reason else line
+
+
+def loop_jacobian(Lambda: ArrayLike, R: ArrayLike, p: ArrayLike, q: ArrayLike) -> Array:
+    """Jacobian [[Lambda + R P, R Q], [I, 0]] of the loop in (z, int z), (..., 2n, 2n).
+
+    Args:
+        Lambda: Open-loop Jacobian in z, (..., n, n), 1/s.
+        R: Gain of the auxiliary command, (..., n, n).
+        p: Signed slopes dpi_i/dz_i, (..., n).
+        q: Signed slopes dpi_i/d(int z_i), (..., n).
+    """
+    Lambda, R = np.asarray(Lambda, dtype=float), np.asarray(R, dtype=float)
+    p, q = np.asarray(p, dtype=float), np.asarray(q, dtype=float)
+    n = Lambda.shape[-1]
+    if p.shape[-1:] != (n,) or q.shape[-1:] != (n,) or R.shape[-2:] != (n, n):
+        raise ValueError(
+            f"Lambda {Lambda.shape} needs R (..., {n}, {n}) and slopes (..., {n}), "
+            f"got R {R.shape}, p {p.shape}, q {q.shape}"
+        )
+    RP, RQ = R * p[..., None, :], R * q[..., None, :]
+    shape = np.broadcast_shapes(Lambda.shape, RP.shape, RQ.shape)
+    J = np.zeros((*shape[:-2], 2 * n, 2 * n))
+    J[..., :n, :n], J[..., :n, n:] = Lambda + RP, RQ
+    J[..., n:, :n] = np.eye(n)
+    return J
+
+
+def circle_criterion(
+    c: float, k1: float, k2: float, *, kind: Kind = "exact", region: str = "everywhere"
+) -> Certificate:
+    """Decide w'' + c w' + k(t) w = 0 with c constant and k anywhere in [k1, k2], w = int z.
+
+    A common quadratic metric exists if and only if 0 < k1 and sqrt(k2) - sqrt(k1) < c. It can be
+    written down: M = [[1, c/2], [c/2, c^2/2 + sqrt(k1 k2)]] in (z, int z). For a rate beta apply
+    the same to e^{beta t} w, with damping c - 2 beta and stiffness k - beta c + beta^2.
+
+    Args:
+        c: Damping -(Lambda + R p), 1/s.
+        k1: Smallest stiffness -R q, 1/s^2.
+        k2: Largest stiffness, 1/s^2.
+        kind: What the certificate shall state about the transforms behind c and k.
+        region: Where c and k hold, in words.
+
+    Raises:
+        ValueError: if k1 > k2 or a value is not finite.
+    """
+    if not (np.isfinite([c, k1, k2]).all() and k1 <= k2):
+        raise ValueError(f"finite c and k1 <= k2 are needed, got c {c}, k1 {k1}, k2 {k2}")
+    corners = np.array([[[-c, -k], [1.0, 0.0]] for k in (k1, k2)])
+    if not _circle(c, k1, k2):
+        first = k1 <= 0 or c <= 0
+        reason = (
+            f"damping {c:.4g} and stiffness from {k1:.4g} on need to be positive"
+            if first
+            else f"sqrt(k2) - sqrt(k1) = {np.sqrt(k2) - np.sqrt(k1):.4g} is not below c = {c:.4g}"
+        )
+        return Certificate(
+            False, kind, violated=corners[0 if first else 1], region=region, reason=reason
+        )
+    low, high = 0.0, c / 2
+    for _ in range(60):
+        beta = (low + high) / 2
+        low, high = (beta, high) if _circle(*_shifted(c, k1, k2, beta)) else (low, beta)
+    beta = _SHARE * low
+    damping, soft, stiff = _shifted(c, k1, k2, beta)
+    metric = np.array([[1, damping / 2], [damping / 2, damping**2 / 2 + np.sqrt(soft * stiff)]])
+    # (w' + beta w, w) are the coordinates of e^{beta t} w
+    shear = np.array([[1.0, beta], [0.0, 1.0]])
+    metric = shear.T @ metric @ shear
+    rate = float(contraction_rate(corners, metric).min())
+    return Certificate(
+        True, kind, rate=rate, metric=metric, region=region, reason="circle criterion"
+    )
+
+
+def _circle(c: float, k1: float, k2: float) -> bool:
+    return bool(c > 0 and k1 > 0 and np.sqrt(k2) - np.sqrt(k1) < c)
+
+
+def _shifted(c: float, k1: float, k2: float, beta: float) -> tuple[float, float, float]:
+    offset = beta**2 - beta * c
+    return c - 2 * beta, k1 + offset, k2 + offset
+
+
+def common_metric(
+    vertices: ArrayLike,
+    *,
+    h: float | None = None,
+    kind: Kind = "exact",
+    region: str = "everywhere",
+) -> Certificate:
+    """Look for one metric in which every vertex, and so every matrix in their hull, contracts.
+
+    Args:
+        vertices: Jacobians, (V, m, m), 1/s; with `h` the steps of a sampled loop.
+        h: Sample time, s, where the vertices are steps.
+        kind: What the certificate shall state about the transforms behind the vertices.
+        region: Where the vertices bound the loop, in words.
+
+    Raises:
+        ValueError: if the vertices have a wrong shape or are not finite.
+    """
+    vertices = np.asarray(vertices, dtype=float)
+    domain: Domain = "continuous" if h is None else "sampled"
+    found = _search(vertices, 0.0, h)
+    if found.metric is None:
+        worst = vertices[found.worst]
+        return Certificate(
+            False,
+            kind,
+            domain,
+            violated=worst,
+            region=region,
+            reason=_why_not(worst, domain),
+        )
+    high = float(-np.linalg.eigvals(vertices).real.max())
+    if h is not None:
+        high = float(-np.log(np.abs(np.linalg.eigvals(vertices)).max()) / h)
+    low = 0.0
+    for _ in range(8):
+        middle = (low + high) / 2
+        low, high = (
+            (middle, high) if _search(vertices, middle, h).metric is not None else (low, middle)
+        )
+    metric = _search(vertices, _SHARE * low, h).metric
+    metric = found.metric if metric is None else metric
+    return Certificate(
+        True,
+        kind,
+        domain,
+        rate=rate_in(vertices, metric, h),
+        metric=metric,
+        region=region,
+        reason=f"one metric for {len(vertices)} vertices",
+    )
+
+
+def rate_in(vertices: ArrayLike, metric: ArrayLike, h: float | None = None) -> float:
+    """Smallest rate of the vertices in a metric, 1/s; with `h` of the steps of a sampled loop."""
+    if h is None:
+        return float(contraction_rate(vertices, metric).min())
+    return float(-np.log(contraction_factor(vertices, metric).max()) / h)
+
+
+def _search(vertices: Array, rate: float, h: float | None) -> MetricSearch:
+    if h is not None:
+        return search_metric(vertices * np.exp(rate * h), discrete=True)
+    return search_metric(vertices + rate * np.eye(vertices.shape[-1]))
+
+
+def _why_not(worst: Array, domain: Domain) -> str:
+    eigenvalues = np.linalg.eigvals(worst)
+    if domain == "sampled" and np.abs(eigenvalues).max() >= 1:
+        return f"a vertex is unstable: spectral radius {np.abs(eigenvalues).max():.4g}"
+    if domain == "continuous" and eigenvalues.real.max() >= 0:
+        return f"a vertex is unstable: eigenvalue real part {eigenvalues.real.max():.4g} 1/s"
+    return "every vertex decays by itself, but no quadratic metric fits them all"
+
+
+def compose_hierarchical(
+    metrics: Sequence[Array],
+    rates: Sequence[float],
+    couplings: Mapping[tuple[int, int], ArrayLike],
+    *,
+    h: float | None = None,
+) -> tuple[Array, float]:
+    """Metric and rate of an upper block-triangular combination of contracting blocks.
+
+    Block i is driven by blocks j > i only. Scaling block i by eps^(n-1-i) shrinks every coupling by
+    a power of eps, so some eps > 0 keeps the rate as near to the slowest block's as wanted.
+
+    Args:
+        metrics: One metric per block, (m_i, m_i).
+        rates: One rate per block, 1/s, positive.
+        couplings: For i < j the vertices (V, m_i, m_j) of the block through which j drives i.
+        h: Sample time, s, where the blocks are steps.
+
+    Returns:
+        The block-diagonal metric and the rate in 1/s.
+
+    Raises:
+        ValueError: if a rate is not positive or a coupling points the wrong way.
+    """
+    if min(rates) <= 0:
+        raise ValueError(f"every block needs a positive rate, got {list(rates)}")
+    if any(i >= j for i, j in couplings):
+        raise ValueError("blocks may only be driven by later ones: couplings need i < j")
+    theta = [metric_factor(metric) for metric in metrics]
+    size = len(metrics)
+    strength = np.zeros((size, size))
+    for (i, j), block in couplings.items():
+        local = theta[i] @ np.asarray(block, dtype=float) @ np.linalg.inv(theta[j])
+        strength[i, j] = np.linalg.norm(local, 2, axis=(-2, -1)).max()
+    eps, level = 1.0, np.arange(size)
+    for _ in range(200):
+        scaled = strength * eps ** np.maximum(level[None] - level[:, None], 0)
+        if h is None:
+            comparison = scaled - np.diag(rates)
+            rate = -float(np.linalg.eigvalsh((comparison + comparison.T) / 2)[-1])
+        else:
+            comparison = scaled + np.diag(np.exp(-h * np.asarray(rates)))
+            rate = -float(np.log(np.linalg.norm(comparison, 2))) / h
+        if rate >= _SHARE * min(rates):
+            break
+        eps *= 0.7
+    blocks = [eps ** (2 * (size - 1 - i)) * metric for i, metric in enumerate(metrics)]
+    return block_diag(*blocks), rate
