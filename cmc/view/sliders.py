@@ -85,8 +85,8 @@ class Slider:
             description=f"{self.label or name}{unit}",
             continuous_update=not slow,
             readout_format="d" if whole else f".{digits}f",
-            style={"description_width": "12em"},
-            layout={"width": "30em"},
+            style={"description_width": "initial"},
+            layout={"width": "28em"},
         )
 
 
@@ -112,8 +112,8 @@ class Choice:
         return kind(
             value=self.start,
             description=self.label or name,
-            style={"description_width": "12em"},
-            layout={"width": "30em"},
+            style={"description_width": "initial"},
+            layout={"width": "28em"},
             **more,
         )
 
@@ -201,12 +201,15 @@ class Explorer(widgets.VBox):
         self.canvas = Canvas(panels, describe, time)
         for values in probes(controls, corners=not slow):
             self.evaluate(**values)  # raises: a broken callback fails the cell
-        self._reset = widgets.Button(description="Reset", tooltip="back to the first values")
+        self._reset = widgets.Button(
+            description="Reset", tooltip="back to the first values", layout={"width": "6em"}
+        )
         self._reset.on_click(lambda _: self.reset())
         self._first = {name: widget.value for name, widget in self.controls.items()}
         for widget in self.controls.values():
             widget.observe(self._changed, "value")
-        super().__init__([*self.controls.values(), self._reset, self.canvas])
+        row = widgets.Box([*self.controls.values(), self._reset], layout={"flex_flow": "row wrap"})
+        super().__init__([row, self.canvas])
 
     @property
     def values(self) -> dict[str, Any]:
