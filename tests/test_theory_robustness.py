@@ -9,10 +9,10 @@ from cmc.theory.disturbance import (
     KINDS,
     peak_gain,
     random_disturbances,
-    tightest_ellipsoid,
     worst_constant,
     worst_signal,
 )
+from cmc.theory.reach import reach, shape_metric, tightest_ellipsoid
 from cmc.theory.robustness import ErrorBall, paper_channel, respond
 
 PUSH = np.array([[1.0], [0.0]])  # a disturbance moves z, not its integral
@@ -103,13 +103,38 @@ def test_each_promise_is_above_the_next_and_above_what_can_happen():
     for _ in range(40):
         J, B, row = random_loop(rng), rng.normal(size=(4, 2)), rng.normal(size=4)
         ball = random_ball(rng, J, B)
-        metric, reach = tightest_ellipsoid(J, B, row)
+        metric, best = tightest_ellipsoid(J, B, row)
+        ellipsoid = reach(J, ball.metric, B)
         peak = peak_gain(J, B, row)
         constant = np.linalg.norm(row @ np.linalg.solve(J, B))
+        sharper = float(ellipsoid.output_bound(row, np.inf, 0.0, 1.0))
         promised = float(ball.output_bound(row, np.inf, 0.0, 1.0))
         slack = 1 + 1e-6
-        assert constant <= peak * slack <= reach * slack**2 <= promised * slack**3
-        assert reach == pytest.approx(np.sqrt(row @ np.linalg.solve(metric, row)))
+        assert constant <= peak * slack <= best * slack**2 <= sharper * slack**3
+        assert sharper <= promised * 1.002  # `reach` looks at a grid of decays
+        assert best == pytest.approx(np.sqrt(row @ np.linalg.solve(metric, row)))
+
+
+def test_ellipsoid_contains_loops_whose_slopes_change_and_shaping_it_makes_it_smaller():
+    rng, size, row = np.random.default_rng(8), 0.7, [1.0, 0.0]
+    corners = np.array([[[-2.0, -k], [1.0, 0.0]] for k in (0.8, 2.4)])
+    found = circle_criterion(2.0, 0.8, 2.4)
+    plain = reach(corners, found.metric, PUSH)
+    shaped = shape_metric(corners, found.metric, PUSH, row)
+    promise = [float(e.output_bound(row, np.inf, 0.0, size)) for e in (plain, shaped)]
+    assert promise[1] < 0.9 * promise[0]
+    assert promise[1] >= size * max(peak_gain(J, PUSH, row) for J in corners) * (1 - 1e-6)
+    times = np.linspace(0.0, 8.0, 321)
+    d = random_disturbances(rng, 320, 1000, size, step=0.025)
+    first, second = rng.normal(size=(2, 1000, 2))
+    rhs = tanh_loop(2.0, 0.8, 2.4)
+    calm = respond(rhs, first, times, np.zeros((320, 1000, 2)))
+    apart = respond(rhs, second, times, d @ PUSH.T) - calm
+    for ellipsoid in (plain, shaped):
+        distance = ellipsoid.distance(apart)
+        assert (distance <= ellipsoid.bound(times[:, None], distance[0], size) * (1 + 1e-9)).all()
+    with pytest.raises(ValueError, match="does not contract"):
+        shape_metric(corners, np.eye(2), PUSH, row)
 
 
 def test_worst_constant_disturbance_is_the_worst_of_many_and_is_where_the_loop_settles():

@@ -1,16 +1,14 @@
 """Disturbances: the worst ones for a linear loop, exactly, and bounded random ones.
 
 The error ball of `cmc.theory.robustness` is an upper bound. What is here says how much of it can
-be reached: `worst_constant` (a matrix norm), `peak_gain` (the worst signal of all, an integral) and
-`tightest_ellipsoid` (the best any constant metric can promise about one signal).
+be reached: `worst_constant` (a matrix norm) and `peak_gain` (the worst signal of all, an integral).
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import expm, solve_continuous_lyapunov
-from scipy.optimize import minimize_scalar
+from scipy.linalg import expm
 
 from cmc.theory.contraction import metric_factor
 
@@ -19,7 +17,12 @@ Array = NDArray[np.float64]
 KINDS = ("constant", "switching", "sine", "white")
 
 
-def _stable(jacobian: ArrayLike) -> tuple[Array, float]:
+def checked_stable(jacobian: ArrayLike) -> tuple[Array, float]:
+    """Return J as a finite Hurwitz matrix, and its largest real part in 1/s.
+
+    Raises:
+        ValueError: if it is not square, not finite or not stable.
+    """
     J = np.asarray(jacobian, float)
     if J.ndim != 2 or J.shape[0] != J.shape[1] or not np.isfinite(J).all():
         raise ValueError(f"wanted a finite Jacobian of shape (n, n), got {J.shape}")
@@ -59,7 +62,7 @@ def worst_constant(
     Raises:
         ValueError: if the loop is not stable.
     """
-    J, _ = _stable(jacobian)
+    J, _ = checked_stable(jacobian)
     theta = np.eye(len(J)) if metric is None else metric_factor(metric)
     _, sizes, directions = np.linalg.svd(-theta @ np.linalg.solve(J, np.asarray(channel, float)))
     return float(sizes[0]), directions[0]
@@ -77,7 +80,7 @@ def worst_signal(
         Disturbances (steps, m) for the steps between `times` (steps + 1,), and the exact reach
         |row xi(t_k)| of the worst signal aimed at each of `times`, (steps + 1,).
     """
-    J, _ = _stable(jacobian)
+    J, _ = checked_stable(jacobian)
     t = np.asarray(times, float)
     middle = 0.5 * (t[1:] + t[:-1])
     weight = _impulse_response(J, channel, row, t[-1] - middle)
@@ -101,7 +104,7 @@ def peak_gain(jacobian: ArrayLike, channel: ArrayLike, row: ArrayLike) -> float:
     Raises:
         ValueError: if the loop is not stable.
     """
-    J, abscissa = _stable(jacobian)
+    J, abscissa = checked_stable(jacobian)
     values = np.linalg.eigvals(J)
     end, turning = 40.0 / -abscissa, float(np.abs(values.imag).max())
     edges = np.concatenate([[0.0], np.geomspace(1e-3 / np.abs(values).max(), end, 400)])
@@ -112,38 +115,6 @@ def peak_gain(jacobian: ArrayLike, channel: ArrayLike, row: ArrayLike) -> float:
     t = edges[:-1, None] + half * (1.0 + nodes)
     length = np.linalg.norm(_impulse_response(J, channel, row, t), axis=-1)
     return float((length * half * weights).sum())
-
-
-def tightest_ellipsoid(
-    jacobian: ArrayLike, channel: ArrayLike, row: ArrayLike
-) -> tuple[Array, float]:
-    """The constant metric that promises most about one signal under ||d|| <= 1.
-
-    For a in (0, -2 max Re lambda) let J Q + Q J^T + a Q + B B^T / a = 0. Then from rest
-    xi^T Q^{-1} xi <= 1 for ever, so |row xi| <= sqrt(row Q row^T); a is searched for the smallest.
-    (Abedor, Nagpal, Poolla 1996.)
-
-    Returns:
-        The metric M = Q^{-1}, in which the disturbed loop stays within distance 1, and the bound
-        on |row xi|.
-
-    Raises:
-        ValueError: if the loop is not stable.
-    """
-    J, abscissa = _stable(jacobian)
-    B, c = np.asarray(channel, float), np.asarray(row, float)
-
-    def ellipsoid(a: float) -> Array:
-        Q = solve_continuous_lyapunov(J + 0.5 * a * np.eye(len(J)), -B @ B.T / a)
-        return 0.5 * (Q + Q.T)
-
-    def reach(logit: float) -> float:
-        return float(c @ ellipsoid(-2.0 * abscissa / (1.0 + np.exp(-logit))) @ c)
-
-    found = minimize_scalar(reach, bounds=(-8.0, 8.0), method="bounded")
-    best = ellipsoid(-2.0 * abscissa / (1.0 + np.exp(-found.x)))
-    metric = np.asarray(np.linalg.inv(best), dtype=np.float64)
-    return metric, float(np.sqrt(c @ best @ c))
 
 
 def random_disturbances(
