@@ -103,9 +103,7 @@ def rate_from_cloud(times: ArrayLike, paths: ArrayLike, metric: ArrayLike | None
 
 def _fit(times: Array, ratio: Array) -> Decay:
     growing = int(np.argmax(ratio)) > len(ratio) // 2
-    envelope = (
-        np.maximum.accumulate(ratio) if growing else np.maximum.accumulate(ratio[::-1])[::-1]
-    )
+    envelope = np.maximum.accumulate(ratio) if growing else np.maximum.accumulate(ratio[::-1])[::-1]
     # below the floor the difference of two nearly equal numbers is rounding, not distance
     usable = envelope > 1e-11
     last = int(usable.sum())

@@ -113,7 +113,7 @@ def _barrier(operators: Array) -> tuple[Array | None, int]:
             worst = int(np.argmax(residual))
             if residual[worst] < -_GAP:
                 return np.tensordot(x, E, 1), worst
-            if decrement < 1e-6:
+            if decrement < 1e-3:
                 break
         if t - constraints / weight > -_GAP:  # a lower bound on the best t: no metric
             return None, worst
@@ -146,17 +146,21 @@ def _newton(
         -scale * np.linalg.lstsq(hessian * scale * scale[:, None], scale * gradient, rcond=None)[0]
     )
     decrement = float(-gradient @ move)
-    length = 1.0 if decrement < 0.06 else 1 / (1 + np.sqrt(decrement))
-    while not _inside(operators, E, eye, x + length * move[:d], t + length * float(move[d])):
+    here, length = _value(operators, E, eye, x, t, weight), 1.0
+    while length > 1e-10:
+        x_new, t_new = x + length * move[:d], t + length * float(move[d])
+        if _value(operators, E, eye, x_new, t_new, weight) <= here - 0.1 * length * decrement:
+            return x_new, t_new, decrement
         length /= 2
-        if length < 1e-12:
-            return x, t, 0.0
-    return x + length * move[:d], t + length * float(move[d]), decrement
+    return x, t, 0.0
 
 
-def _inside(operators: Array, E: Array, eye: Array, x: Array, t: float) -> bool:
-    """Whether every constraint holds strictly."""
-    eigenvalues = np.linalg.eigvalsh(np.tensordot(x, E, 1))
-    if not 1 < eigenvalues[0] <= eigenvalues[-1] < _CONDITION:
-        return False
-    return bool(np.linalg.eigvalsh(_apply(operators, x)).max() < t)
+def _value(operators: Array, E: Array, eye: Array, x: Array, t: float, weight: float) -> float:
+    """The barrier function; infinity outside the constraints."""
+    P = np.tensordot(x, E, 1)
+    inside = np.concatenate([t * eye - _apply(operators, x), [P - eye, _CONDITION * eye - P]])
+    try:
+        factors = np.linalg.cholesky(inside)
+    except np.linalg.LinAlgError:
+        return np.inf
+    return weight * t - 2 * float(np.log(np.einsum("vii->vi", factors)).sum())
