@@ -1,4 +1,4 @@
-"""The auxiliary decomposition against plain `numpy.linalg` eig and qr, and the control rate it allows.
+"""The auxiliary decomposition against plain `numpy.linalg` eig and qr, and the control rate.
 
 Both sides return T_y, T_a, Lambda, R; ours also validates its input, sorts, fixes signs and refuses
 complex, defective and singular systems. `numpy_eig_qr` is the two calls alone, nothing around them.
