@@ -14,6 +14,7 @@ from cmc.policies import (
     ModularPolicy,
     NegativeWeightError,
     PositiveNetwork,
+    StackedMLP,
     as_numpy,
     tanh,
 )
@@ -73,6 +74,28 @@ def test_positive_jacobian_equals_autograd(hidden, bias):
         torch.testing.assert_close(torch.einsum("biij->bij", full), slope)
         assert full[:, 0, 1].abs().max() == 0  # one network per dimension: no cross slopes
         assert full[:, 1, 0].abs().max() == 0
+
+
+@pytest.mark.parametrize("bias", [True, False])
+def test_gradients_of_the_stacked_network_to_second_order(bias):
+    network = StackedMLP(2, 3, (5, 4), copies=2, seeds=[0, 1], bias=bias, dtype=f64)
+    shake(network, 0.3)
+    x = signals(4, 3, 2).requires_grad_()
+
+    def run(x, *weights):
+        return network.run(x, weights)
+
+    weights = [weight.detach().clone().requires_grad_() for weight in network.weights]
+    assert torch.autograd.gradcheck(run, (x, *weights))
+    assert torch.autograd.gradgradcheck(run, (x, *weights))
+    plain = network.hidden_values(x, list(network.weights))[-1]
+    torch.testing.assert_close(network(x), plain)
+    ours, theirs = (
+        torch.autograd.grad(out.square().sum(), list(network.parameters()))
+        for out in (network(x), plain)
+    )
+    for mine, other in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(mine, other)
 
 
 def test_unconstrained_jacobian_equals_autograd_and_has_both_signs():
@@ -215,7 +238,7 @@ def test_observation_layout():
         observation[..., 7:11].reshape(2, 6, 2, 2),
     )
     torch.testing.assert_close(policy(observation), expected)
-    np.testing.assert_array_equal(as_numpy(policy)(observation.numpy()), expected.detach().numpy())
+    np.testing.assert_allclose(as_numpy(policy)(observation.numpy()), expected.detach().numpy())
     observation[0, 0, 0] = torch.nan
     with pytest.raises(ValueError, match="finite"):
         as_numpy(policy)(observation.numpy())
@@ -231,6 +254,26 @@ def test_observation_layout():
     assert direct(signals(3, 12)).shape == (3, 2)
     with pytest.raises(ValueError, match="flat inputs"):
         direct(signals(3, 2))
+
+
+@pytest.mark.parametrize("seeds", [None, [3], [0, 1]])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda **o: ModularPolicy(PositiveNetwork(2, slope_min=0.1, slope_max=2, **o), u0=[1, 2]),
+        lambda **o: ModularPolicy(PositiveNetwork(2, bias=False, **o), R=[-1.0, 2.0]),
+        lambda **o: ModularPolicy(IndependentNetwork(2, **o), R=[-4.0, 2.0], normalise=True),
+        lambda **o: ModularPolicy(IndependentNetwork(2, **o), integral=False),
+        lambda **o: ModularPolicy(JointNetwork(2, **o), R=[-1.0, 2.0]),
+        lambda **o: ModularPolicy(ConvexGradientNetwork(2, **o)),
+        lambda **o: DirectPolicy(JointNetwork(2, inputs=3, **o), part=slice(1, 4), u0=[1, 2]),
+    ],
+)
+def test_the_numpy_function_equals_the_module(make, seeds):
+    policy = make(seeds=seeds, dtype=f64)
+    observation = signals(*([len(seeds)] if seeds else []), 7, 4)
+    expected = policy(observation).detach().numpy()
+    np.testing.assert_allclose(as_numpy(policy)(observation.numpy()), expected, rtol=1e-12)
 
 
 def test_state_dict_round_trip_and_refusal():

@@ -139,12 +139,11 @@ class PPO:
             c.steps,
         )
         data = self._learning_data(rollout)
-        count = data["advantage"].shape[1]
         report: dict[str, Tensor] = {}
         for _ in range(c.epochs):
-            order = np.stack([generator.permutation(count) for generator in generators])
-            for part in np.array_split(order, c.minibatches, axis=1):
-                report = self._minibatch(data, torch.as_tensor(part))
+            shuffled = shuffle(data, generators)
+            for batch in torch.tensor_split(shuffled, c.minibatches, dim=1):
+                report = self._minibatch(batch)
         self.updates += 1
         steps = c.steps * self.episodes
         return {
@@ -153,7 +152,8 @@ class PPO:
             "steps": steps,
             "episode_return": rollout.reward.sum(1).mean(1),
             "std": self.log_std.detach().exp()[:, 0].numpy(),
-            **{name: value.numpy() for name, value in report.items()},
+            "value_loss": report["value_error"].square().mean(1).numpy(),
+            "clip_fraction": ((report["ratio"] - 1.0).abs() > c.clip).float().mean(1).numpy(),
         }
 
     def train(
@@ -215,8 +215,8 @@ class PPO:
         return drawn if len(drawn) > 1 else drawn[0]
 
     @torch.no_grad()
-    def _learning_data(self, rollout: Rollout) -> dict[str, Tensor]:
-        """Advantages, value targets and log-probabilities, flat in time: (S, T E, ...)."""
+    def _learning_data(self, rollout: Rollout) -> Tensor:
+        """What an update learns from, one row a step: (S, T E, columns), see `_columns`."""
         c = self.config
         shape = rollout.reward.shape
         value = self.critic(rollout.privileged.flatten(1, 2)).reshape(shape).numpy()
@@ -224,41 +224,80 @@ class PPO:
         advantage = generalised_advantage(rollout, value, following, c.gamma, c.gae_lambda)
         noise = rollout.noise
         log_probability = -(0.5 * noise * noise + self.log_std.unsqueeze(1)).sum(-1)
-        data = {
-            "observation": rollout.observation,
-            "privileged": rollout.privileged,
-            "action": rollout.action,
-            "log_probability": log_probability,
-            "advantage": torch.as_tensor(advantage, dtype=torch.float32),
-            "target": torch.as_tensor(advantage + value, dtype=torch.float32),
-        }
-        return {name: part.flatten(1, 2) for name, part in data.items()}
+        scalars = torch.stack(
+            [log_probability, torch.from_numpy(advantage), torch.from_numpy(advantage + value)], -1
+        )
+        parts = (rollout.observation, rollout.privileged, rollout.action, scalars)
+        self._columns = [part.shape[-1] for part in parts]
+        return torch.cat(parts, -1).flatten(1, 2)
 
-    def _minibatch(self, data: Mapping[str, Tensor], index: Tensor) -> dict[str, Tensor]:
-        """One step of Adam on the minibatch `index` (S, m); losses are sums over seeds."""
+    def _minibatch(self, batch: Tensor) -> dict[str, Tensor]:
+        """One step of Adam on a minibatch (S, m, columns); seeds do not mix.
+
+        The loss of a seed is the clipped surrogate plus `value_weight` times the squared error of
+        the critic. Its derivatives by the networks' outputs are short, so they are written down
+        (`surrogate_gradient`); autograd goes on from there, through the networks.
+        """
         c = self.config
-        row = torch.arange(len(self.seeds)).unsqueeze(1)
-        batch = {name: part[row, index] for name, part in data.items()}
-        advantage = batch["advantage"]
-        spread, centre = torch.std_mean(advantage, dim=1, keepdim=True)
-        advantage = (advantage - centre) / (spread + 1e-8)
-
-        mean = self.policy(batch["observation"])
-        noise = (batch["action"] - mean) * torch.exp(-self.log_std)
-        log_probability = -(0.5 * noise * noise + self.log_std).sum(-1)
-        ratio = torch.exp(log_probability - batch["log_probability"])
-        clipped = ratio.clamp(1.0 - c.clip, 1.0 + c.clip)
-        policy_loss = -torch.minimum(ratio * advantage, clipped * advantage).mean(1)
-        value_loss = (self.critic(batch["privileged"])[..., 0] - batch["target"]).square().mean(1)
-
+        observation, privileged, action, scalars = batch.split(self._columns, -1)
+        old_log_probability, advantage, target = scalars.unbind(-1)
+        mean, value = self.policy(observation), self.critic(privileged)
+        with torch.no_grad():
+            to_mean, to_log_std, ratio = surrogate_gradient(
+                mean, self.log_std, action, old_log_probability, normalised(advantage), c.clip
+            )
+            error = value - target.unsqueeze(-1)
+            to_value = (2.0 * c.value_weight / error.shape[1]) * error
         self.optimiser.zero_grad()
-        (policy_loss + c.value_weight * value_loss).sum().backward()
+        torch.autograd.backward([mean, value, self.log_std], [to_mean, to_value, to_log_std])
         clip_gradients([p.grad for p in self.parameters.values()], len(self.seeds), c.max_norm)
         self.optimiser.step()
         with torch.no_grad():
             self.log_std.clamp_(min=c.log_std_floor)
-            outside = ((ratio - 1.0).abs() > c.clip).float().mean(1)
-        return {"value_loss": value_loss.detach(), "clip_fraction": outside}
+        return {"ratio": ratio, "value_error": error[..., 0]}
+
+
+def normalised(advantage: Tensor) -> Tensor:
+    """Shift and scale each row of advantages (S, m) to mean 0 and standard deviation 1."""
+    spread, centre = torch.std_mean(advantage, dim=1, keepdim=True)
+    return (advantage - centre) / (spread + 1e-8)
+
+
+def surrogate_gradient(
+    mean: Tensor,
+    log_std: Tensor,
+    action: Tensor,
+    old_log_probability: Tensor,
+    advantage: Tensor,
+    clip: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradient of the clipped surrogate for a Gaussian policy, by mean and log_std.
+
+    With r = p(action)/p_old(action) the loss L = -mean_m min(r A, clip(r, 1 - c, 1 + c) A) has
+
+        dL/dlog p = -r A / m   where r A is the smaller of the two, and 0 where it is clipped,
+        dlog p/dmean = x / std,   dlog p/dlog_std = x^2 - 1   with x = (action - mean) / std.
+
+    Args:
+        mean: (S, m, n).
+        log_std: (S, 1, n).
+        action: (S, m, n).
+        old_log_probability: (S, m), without the constant -n/2 log 2 pi.
+        advantage: A, (S, m).
+        clip: c.
+
+    Returns:
+        dL/dmean (S, m, n), dL/dlog_std (S, 1, n) and the ratio r (S, m).
+    """
+    precision = torch.exp(-log_std)
+    x = (action - mean) * precision
+    square = x * x
+    log_probability = -(0.5 * square + log_std).sum(-1)
+    ratio = torch.exp(log_probability - old_log_probability)
+    gain = ratio * advantage
+    active = gain <= ratio.clamp(1.0 - clip, 1.0 + clip) * advantage
+    slope = (gain * active).mul_(-1.0 / advantage.shape[1]).unsqueeze(-1)
+    return slope * (x * precision), (slope * (square - 1.0)).sum(1, keepdim=True), ratio
 
 
 def generalised_advantage(
@@ -282,6 +321,14 @@ def generalised_advantage(
     for t in range(delta.shape[1] - 2, -1, -1):
         advantage[:, t] += carry[:, t] * advantage[:, t + 1]
     return advantage
+
+
+def shuffle(data: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
+    """Put the rows of data (S, N, columns) in random order, each seed by its own generator."""
+    S, N, columns = data.shape
+    order = np.stack([g.permutation(N) + N * s for s, g in enumerate(generators)])
+    index = torch.from_numpy(order.reshape(-1))
+    return data.reshape(S * N, columns).index_select(0, index).reshape(S, N, columns)
 
 
 def clip_gradients(gradients: Sequence[Tensor | None], seeds: int, max_norm: float) -> None:

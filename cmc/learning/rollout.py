@@ -12,6 +12,8 @@ from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from cmc.policies import as_numpy
+
 
 @dataclass(frozen=True)
 class Rollout:
@@ -65,19 +67,19 @@ def collect(
     actions = np.empty((S, steps, E, n), dtype=np.float32)
     reward = np.empty((S, steps, E), dtype=np.float32)
     terminated, done = (np.empty((S, steps, E), dtype=bool) for _ in range(2))
-    with torch.inference_mode():
-        for t in range(steps):
-            seen[:, t] = observation.reshape(S, E, d)
-            known[:, t] = privileged.reshape(S, E, p)
-            mean = policy(torch.from_numpy(np.ascontiguousarray(seen[:, t])))
-            actions[:, t] = mean.numpy() + kick[:, t]
-            observation, gain, end, limit, info = env.step(actions[:, t].reshape(S * E, n))
-            privileged = info.get("privileged", observation)
-            reached = _before_restart(privileged, end | limit, info)
-            following[:, t] = reached.reshape(S, E, p)
-            reward[:, t] = gain.reshape(S, E)
-            terminated[:, t] = end.reshape(S, E)
-            done[:, t] = (end | limit).reshape(S, E)
+    act = as_numpy(policy)
+    for t in range(steps):
+        seen[:, t] = observation.reshape(S, E, d)
+        known[:, t] = privileged.reshape(S, E, p)
+        action = act(observation.reshape(S, E, d)) + kick[:, t]
+        actions[:, t] = action
+        observation, gain, end, limit, info = env.step(action.reshape(S * E, n))
+        privileged = info.get("privileged", observation)
+        reached = _before_restart(privileged, end | limit, info)
+        following[:, t] = reached.reshape(S, E, p)
+        reward[:, t] = gain.reshape(S, E)
+        terminated[:, t] = end.reshape(S, E)
+        done[:, t] = (end | limit).reshape(S, E)
     tensor = torch.from_numpy
     return Rollout(
         observation=tensor(seen),

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from cmc.policies.convex import ConvexGradientNetwork
 from cmc.policies.fast_tanh import tanh
-from cmc.policies.modular import DirectPolicy, ModularPolicy, as_numpy
+from cmc.policies.frozen import as_numpy
+from cmc.policies.modular import DirectPolicy, ModularPolicy
 from cmc.policies.positive import NegativeWeightError, PositiveNetwork
 from cmc.policies.stacked import StackedMLP
 from cmc.policies.unconstrained import IndependentNetwork, JointNetwork

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch
@@ -52,8 +51,8 @@ class ModularPolicy(nn.Module):
         if "s" not in self.layout or not set(self.layout) <= {"s", "R", "T_a"}:
             raise ValueError(f"wanted a layout of 's', 'R' and 'T_a'; got {sorted(self.layout)}")
         dtype = next(network.parameters()).dtype
-        self.register_buffer("u0", _vector("u0", u0, self.n, dtype))
-        self.register_buffer("R", _vector("R", R, self.n, dtype))
+        self.register_buffer("u0", _vector("u0", u0, self.n, dtype), persistent=False)
+        self.register_buffer("R", _vector("R", R, self.n, dtype), persistent=False)
         if not bool((self.R != 0).all()):
             raise ValueError(f"wanted no zero on the diagonal of R; got {R!r}")
 
@@ -69,10 +68,10 @@ class ModularPolicy(nn.Module):
     def command(self, s: Tensor, R: Tensor, T_a: Tensor | None = None) -> Tensor:
         """Return u = u0 + T_a a from s (..., n, 2), diag(R) (..., n) and T_a (..., n, n)."""
         factor = 1.0 / R if self.normalise else torch.sign(R)
-        a = -factor * self.network(self._visible(s))  # constraint_sign
-        if T_a is not None:
-            a = (T_a * a.unsqueeze(-2)).sum(-1)
-        return self.u0 + a
+        pi = self.network(self._visible(s))
+        if T_a is None:
+            return torch.addcmul(self.u0, factor, pi, value=-1.0)  # constraint_sign
+        return self.u0 - (T_a * (factor * pi).unsqueeze(-2)).sum(-1)  # constraint_sign
 
     def jacobian(self, s: Tensor) -> Tensor:
         """Slopes of the network, before the sign rule: s (..., n, 2) to (..., n, 2)."""
@@ -106,7 +105,7 @@ class DirectPolicy(nn.Module):
         self.network, self.part = network, part
         self.n = int(network.n)  # type: ignore[arg-type]
         dtype = next(network.parameters()).dtype
-        self.register_buffer("u0", _vector("u0", u0, self.n, dtype))
+        self.register_buffer("u0", _vector("u0", u0, self.n, dtype), persistent=False)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the command (..., n) for an observation (..., d)."""
@@ -118,20 +117,3 @@ def _vector(name: str, value: ArrayLike, n: int, dtype: torch.dtype) -> Tensor:
     if array.shape not in ((), (1,), (n,)) or not np.isfinite(array).all():
         raise ValueError(f"wanted {name} finite, a number or ({n},); got {value!r}")
     return torch.as_tensor(np.broadcast_to(array, (n,)).copy(), dtype=dtype)
-
-
-def as_numpy(policy: nn.Module) -> Any:
-    """Return a function from numpy observations to numpy commands that runs `policy`.
-
-    Raises (from the returned function):
-        ValueError: if an observation is not finite.
-    """
-    dtype = next(policy.parameters()).dtype
-
-    def act(observation: np.ndarray) -> np.ndarray:
-        if not np.isfinite(observation).all():
-            raise ValueError("wanted finite observations; got NaN or infinity")
-        with torch.no_grad():
-            return policy(torch.as_tensor(observation, dtype=dtype)).numpy()
-
-    return act

@@ -70,6 +70,7 @@ class PositiveNetwork(nn.Module):
         self.seeds = None if self.mlp.seeds is None else len(self.mlp.seeds)
         low = _bound("slope_min", slope_min, (n, 2))
         self._constant("slope_min", low, dtype)
+        self._bypass = bool(low.any())
         self._constant("room", None, dtype)
         self._constant("joint", None, dtype)
         if slope_max is not None:
@@ -91,7 +92,9 @@ class PositiveNetwork(nn.Module):
         self.register_load_state_dict_pre_hook(_refuse_negative)
 
     def _constant(self, name: str, value: Array | None, dtype: torch.dtype) -> None:
-        self.register_buffer(name, None if value is None else torch.as_tensor(value, dtype=dtype))
+        """Keep a number of the configuration; it is not part of the state dict."""
+        tensor = None if value is None else torch.as_tensor(value, dtype=dtype)
+        self.register_buffer(name, tensor, persistent=False)
 
     def positive_weights(self) -> list[Tensor]:
         """Weights (stack, in, out) as used: absolute values, caps on the first and last."""
@@ -111,7 +114,8 @@ class PositiveNetwork(nn.Module):
     def forward(self, s: Tensor) -> Tensor:
         """Evaluate the networks: s (..., n, 2) to (..., n); with seeds s is (seeds, ..., n, 2)."""
         out = self.mlp.run(to_stack(s, self.seeds, self.n), self.positive_weights())
-        return from_stack(out[..., 0], s, self.seeds) + (self.slope_min * s).sum(-1)
+        pi = from_stack(out[..., 0], s, self.seeds)
+        return pi + (self.slope_min * s).sum(-1) if self._bypass else pi
 
     def jacobian(self, s: Tensor) -> Tensor:
         """Slopes d pi_i / d s_ij in closed form (`product`): s (..., n, 2) to (..., n, 2)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -96,16 +96,56 @@ class StackedMLP(nn.Module):
 
     def run(self, x: Tensor, weights: Sequence[Tensor]) -> Tensor:
         """Evaluate with the given weights (stack, in, out) in place of the parameters."""
-        return self.hidden_values(x, weights)[-1]
+        return _Network.apply(x, len(weights), *weights, *self.biases)
 
     def hidden_values(self, x: Tensor, weights: Sequence[Tensor]) -> list[Tensor]:
         """Values after every layer, the output last; x (stack, batch, inputs)."""
-        values: list[Tensor] = []
-        for layer, weight in enumerate(weights):
-            x = torch.baddbmm(self.biases[layer], x, weight) if self.bias else torch.bmm(x, weight)
-            x = tanh(x) if layer < len(weights) - 1 else x
-            values.append(x)
-        return values
+        return _layers(x, weights, list(self.biases))
+
+
+def _layers(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> list[Tensor]:
+    """Values after every layer, by ordinary differentiable operations."""
+    values: list[Tensor] = []
+    for layer, weight in enumerate(weights):
+        x = torch.baddbmm(biases[layer], x, weight) if biases else torch.bmm(x, weight)
+        x = tanh(x) if layer < len(weights) - 1 else x
+        values.append(x)
+    return values
+
+
+class _Network(torch.autograd.Function):
+    """The whole network as one node of the graph: small networks cost mostly bookkeeping."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, depth: int, *parameters: Tensor) -> Tensor:
+        values = _layers(x, parameters[:depth], parameters[depth:])
+        ctx.depth = depth
+        ctx.save_for_backward(x, *parameters, *values[:-1])
+        return values[-1]
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        depth = ctx.depth
+        x, *saved = ctx.saved_tensors
+        weights, biases = saved[:depth], saved[depth : -(depth - 1)]
+        if torch.is_grad_enabled():  # a second derivative is wanted: back through plain operations
+            inputs = [t for t in (x, *weights, *biases) if t.requires_grad]
+            output = _layers(x, weights, biases)[-1]
+            found = iter(torch.autograd.grad(output, inputs, gradients[0], create_graph=True))
+            whole = [next(found) if t.requires_grad else None for t in (x, *weights, *biases)]
+            return whole[0], None, *whole[1:]
+        values = [x, *saved[len(weights) + len(biases) :]]
+        slope, to_weights, to_biases = gradients[0], [], []
+        for layer in range(depth - 1, -1, -1):
+            to_weights.append(torch.bmm(values[layer].transpose(1, 2), slope))
+            if biases:
+                to_biases.append(slope.sum(1, keepdim=True))
+            if layer > 0 or ctx.needs_input_grad[0]:
+                slope = torch.bmm(slope, weights[layer].transpose(1, 2))
+            if layer > 0:
+                slope = torch.ops.aten.tanh_backward(slope, values[layer])
+        to_input = slope if ctx.needs_input_grad[0] else None
+        return to_input, None, *to_weights[::-1], *to_biases[::-1]
 
 
 def _draw(
