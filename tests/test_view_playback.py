@@ -311,6 +311,30 @@ def test_shown_in_a_notebook_as_a_frame_on_the_file(recording, tmp_path, monkeyp
             recording.show(path)
 
 
+def test_fixed_cameras_and_goal_zones_of_the_model_are_taken_over():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><asset><material name="goal" rgba="0 1 0 .4"/></asset><worldbody>
+        <body pos="0 0 1"><camera name="desk" pos="2 0 0" xyaxes="0 1 0 0 0 1"/></body>
+        <body><joint/><camera name="moving"/><geom size=".1"/></body>
+        <site name="zone" type="box" size=".1 .2 .3" pos="1 2 3" material="goal"/>
+        <site name="frame" size=".1"/></worldbody></mujoco>"""
+    )
+    made = record(model, np.zeros((1, 1)), [0.0])
+    assert list(made.cameras) == ["whole scene", "desk"]
+    assert made.cameras["desk"].position == pytest.approx((2, 0, 1))
+    along = np.subtract(made.cameras["desk"].target, made.cameras["desk"].position)
+    assert along[0] < 0
+    np.testing.assert_allclose(along[1:], 0, atol=1e-12)
+    drawn = {c["path"]: c for c in commands(made) if c["type"] == "set_object"}
+    assert "/meshcat/world/site1" not in drawn
+    box = drawn["/meshcat/world/site0"]["object"]
+    assert box["geometries"][0]["height"] == pytest.approx(0.4)
+    assert box["materials"][0]["opacity"] == pytest.approx(0.4)
+    place = next(c["matrix"] for c in commands(made) if c["path"] == "/meshcat/world/site0"
+                 and c["type"] == "set_transform")  # fmt: skip
+    assert place[12:15] == [1, 2, 3]
+
+
 def test_own_cameras_replace_the_presets(model):
     qpos, _, times = tumble(model, frames=2)
     mine = {"mine": Camera((1, 0, 0), (0, 0, 0))}

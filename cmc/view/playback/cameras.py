@@ -63,17 +63,30 @@ def scene_ball(
     return (low + high) / 2, float(np.linalg.norm(high - low) / 2)
 
 
-def default_cameras(ball: tuple[Array, float], trails: dict[str, Array]) -> dict[str, Camera]:
-    """Presets that frame the whole scene, and each trail from near, from above and moving along."""
+def default_cameras(
+    model: mujoco.MjModel, ball: tuple[Array, float], trails: dict[str, Array]
+) -> dict[str, Camera]:
+    """Presets: the whole scene, the model's own fixed cameras, and views of each trail.
+
+    A trail is seen from near, from above, from the side, and moving along with it.
+    """
     presets = {"whole scene": around(*ball)}
+    focus = next(iter(trails.values())).mean(axis=0) if trails else ball[0]
+    still = model.body_weldid[model.cam_bodyid] == 0
+    for camera in np.flatnonzero(still & (model.cam_mode == mujoco.mjtCamLight.mjCAMLIGHT_FIXED)):
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, int(camera))
+        position, ahead = model.cam_pos0[camera], -model.cam_mat0[camera].reshape(3, 3)[:, 2]
+        reach = max(float((focus - position) @ ahead), 0.01)
+        preset = Camera(_triple(position), _triple(position + reach * ahead))
+        presets[name or f"camera {camera}"] = preset
     for name, points in trails.items():
         low, high = points.min(axis=0), points.max(axis=0)
         radius = max(0.75 * float(np.linalg.norm(high - low)), 0.04 * ball[1])
         middle = (low + high) / 2
-        presets[f"{name}: near"] = around(middle, radius)
+        presets[f"{name}: near"] = around(middle, radius, elevation=40.0)
         presets[f"{name}: above"] = around(middle, radius, azimuth=-90.0, elevation=88.0)
         presets[f"{name}: side"] = around(middle, radius, azimuth=-90.0, elevation=8.0)
-        presets[f"{name}: follow"] = around(points[0], radius, follow=name)
+        presets[f"{name}: follow"] = around(points[0], radius, elevation=40.0, follow=name)
     return presets
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+Rgba = tuple[float, float, float, float]
 _DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
 _INFINITE = 30.0  # half-size in metres at which a plane without bounds is drawn
 
@@ -61,13 +62,9 @@ def transform(position: Array, quaternion: Array) -> Array:
     return matrix
 
 
-def color(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float]:
+def color(model: mujoco.MjModel, geom: int) -> Rgba:
     """Color MuJoCo shows: the geom's own unless it is the default grey and a material is set."""
-    rgba = model.geom_rgba[geom]
-    if model.geom_matid[geom] >= 0 and np.allclose(rgba, _DEFAULT_RGBA):
-        rgba = model.mat_rgba[model.geom_matid[geom]]
-    r, g, b, a = (float(c) for c in np.clip(rgba, 0.0, 1.0))
-    return r, g, b, a
+    return _rgba(model, model.geom_rgba[geom], int(model.geom_matid[geom]))
 
 
 def geom_mesh(model: mujoco.MjModel, geom: int) -> tuple[mg.Mesh, Array]:
@@ -77,29 +74,68 @@ def geom_mesh(model: mujoco.MjModel, geom: int) -> tuple[mg.Mesh, Array]:
         ValueError: for height fields, signed-distance geoms and other types without a counterpart.
     """
     kind = mujoco.mjtGeom(model.geom_type[geom])
-    geometry, turned = _geometry(model, geom, kind)
-    r, g, b, a = color(model, geom)
+    if kind == mujoco.mjtGeom.mjGEOM_MESH:
+        geometry, turned = _mesh(model, int(model.geom_dataid[geom])), False
+    else:
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"number {geom}"
+        geometry, turned = _shape(f"geom {name}", kind, model.geom_size[geom])
+    mesh = _dressed(geometry, kind, color(model, geom), f"geom{geom}")
+    local = transform(model.geom_pos[geom], model.geom_quat[geom])
+    return mesh, local @ _Y_TO_Z if turned else local
+
+
+def site_mesh(model: mujoco.MjModel, site: int) -> tuple[mg.Mesh, Array]:
+    """Meshcat object of one site, such as a goal zone, and its transform in its body's frame."""
+    kind = mujoco.mjtGeom(model.site_type[site])
+    geometry, turned = _shape(f"site number {site}", kind, model.site_size[site])
+    rgba = _rgba(model, model.site_rgba[site], int(model.site_matid[site]))
+    local = transform(model.site_pos[site], model.site_quat[site])
+    mesh = _dressed(geometry, kind, rgba, f"site{site}")
+    return mesh, local @ _Y_TO_Z if turned else local
+
+
+def _rgba(model: mujoco.MjModel, rgba: Array, material: int) -> Rgba:
+    if material >= 0 and np.allclose(rgba, _DEFAULT_RGBA):
+        rgba = model.mat_rgba[material]
+    r, g, b, a = (float(c) for c in np.clip(rgba, 0.0, 1.0))
+    return r, g, b, a
+
+
+def _dressed(geometry: mg.Geometry, kind: mujoco.mjtGeom, rgba: Rgba, name: str) -> mg.Mesh:
+    """A geometry with its material; three.js sees both sides of open shapes only."""
+    r, g, b, a = rgba
+    plane, triangles = kind == mujoco.mjtGeom.mjGEOM_PLANE, kind == mujoco.mjtGeom.mjGEOM_MESH
     material = mg.MeshPhongMaterial(
         color=(round(255 * r) << 16) + (round(255 * g) << 8) + round(255 * b),
         opacity=a,
-        side=2 if kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_MESH) else 0,
+        side=2 if plane or triangles else 0,
         shininess=35,
         specular=0x2A2A2A,
-        flatShading=kind == mujoco.mjtGeom.mjGEOM_MESH,
-        polygonOffset=kind == mujoco.mjtGeom.mjGEOM_PLANE,  # lines drawn on it stay visible
+        flatShading=triangles,
+        depthWrite=a == 1.0,  # what lies behind a see-through wall is seen from every side
+        polygonOffset=plane,  # lines drawn on a floor stay visible
         polygonOffsetFactor=1,
         polygonOffsetUnits=1,
     )
     mesh = mg.Mesh(geometry, material)
     # meshcat draws random uuids; fixed ones make the same recording the same file
-    mesh.uuid, geometry.uuid, material.uuid = (f"{part}{geom}" for part in ("mesh", "shape", "mat"))
-    local = transform(model.geom_pos[geom], model.geom_quat[geom])
-    return mesh, local @ _Y_TO_Z if turned else local
+    mesh.uuid, geometry.uuid, material.uuid = (
+        f"{part} {name}" for part in ("mesh", "shape", "mat")
+    )
+    return mesh
 
 
-def _geometry(model: mujoco.MjModel, geom: int, kind: mujoco.mjtGeom) -> tuple[mg.Geometry, bool]:
-    """Geometry of one geom, and whether its axis is y and must be turned to MuJoCo's z."""
-    size = [float(s) for s in model.geom_size[geom]]
+def _mesh(model: mujoco.MjModel, mesh: int) -> mg.Geometry:
+    first, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+    vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
+    return mg.TriangularMeshGeometry(
+        vertices, model.mesh_face[face : face + model.mesh_facenum[mesh]]
+    )
+
+
+def _shape(what: str, kind: mujoco.mjtGeom, sizes: Array) -> tuple[mg.Geometry, bool]:
+    """A primitive, and whether its axis is y and must be turned to MuJoCo's z."""
+    size = [float(s) for s in sizes]
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
         return RoundEllipsoid([size[0]] * 3), False
     if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
@@ -114,14 +150,7 @@ def _geometry(model: mujoco.MjModel, geom: int, kind: mujoco.mjtGeom) -> tuple[m
         x, y = (s if s > 0 else _INFINITE for s in size[:2])
         corners = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
         return mg.TriangularMeshGeometry(corners, np.array([[0, 1, 2], [0, 2, 3]])), False
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        mesh = model.geom_dataid[geom]
-        first, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
-        vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
-        faces = model.mesh_face[face : face + model.mesh_facenum[mesh]]
-        return mg.TriangularMeshGeometry(vertices, faces), False
-    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"number {geom}"
     raise ValueError(
-        f"geom {name} is a {kind.name}; drawn are spheres, ellipsoids, boxes, "
-        "cylinders, capsules, planes and meshes"
+        f"{what} is a {kind.name}; drawn are spheres, ellipsoids, boxes, cylinders, capsules, "
+        "planes and meshes"
     )

@@ -52,7 +52,9 @@ function aimLights() {
   const target = new THREE.Vector3(t.x, -t.z, t.y);
   const offset = new THREE.Vector3(eye.x - t.x, -(eye.z - t.z), eye.y - t.y).normalize();
   sun.target.position.copy(target);
-  sun.position.set(0.35, -1.15, 1.9).add(target);
+  // From near the sun stands low, or the hand above the task would put it in the shade.
+  const height = 0.6 + 1.3 * Math.min(Math.max((reach - 0.3) / 0.9, 0), 1);
+  sun.position.set(0.35, -1.15, height).add(target);
   fill.position.copy(target).add(offset);
   fill.target = sun.target;
   const box = sun.shadow.camera, half = reach * 0.8;

@@ -19,7 +19,7 @@ import umsgpack
 from numpy.typing import ArrayLike, NDArray
 
 from cmc.view.playback.cameras import Camera, default_cameras, scene_ball
-from cmc.view.playback.geometry import color, geom_mesh, transform
+from cmc.view.playback.geometry import color, geom_mesh, site_mesh, transform
 from cmc.view.playback.overlays import Arrow, Overlay, as_overlays, trail
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class Recording:
 
 
 def draw(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[int]) -> CommandLog:
-    """Draw every visible geom of the listed groups at the pose `data` holds."""
+    """Draw the visible geoms, and sites with a material, of the groups at the pose `data` holds."""
     log = CommandLog()
     scene = meshcat.Visualizer(window=log)  # type: ignore[no-untyped-call]
     for body in drawn_bodies(model, groups):
@@ -101,12 +101,20 @@ def draw(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[int]) -> C
             mesh, local = geom_mesh(model, geom)
             node[f"geom{geom}"].set_object(mesh)
             node[f"geom{geom}"].set_transform(local)
+        for site in _visible_sites(model, body, groups):
+            mesh, local = site_mesh(model, site)
+            node[f"site{site}"].set_object(mesh)
+            node[f"site{site}"].set_transform(local)
     return log
 
 
 def drawn_bodies(model: mujoco.MjModel, groups: Sequence[int]) -> list[int]:
-    """Bodies that own at least one visible geom."""
-    return [b for b in range(model.nbody) if _visible_geoms(model, b, groups)]
+    """Bodies that own at least one visible geom or site."""
+    return [
+        b
+        for b in range(model.nbody)
+        if _visible_geoms(model, b, groups) or _visible_sites(model, b, groups)
+    ]
 
 
 def body_path(model: mujoco.MjModel, body: int) -> str:
@@ -144,7 +152,7 @@ def record(
         cameras: presets; left out, they frame the scene and, if there is a trail, its end.
         mocap: positions (T, nmocap, 3) and quaternions (T, nmocap, 4) of mocap bodies, where the
             states do not hold them.
-        groups: geom groups that are drawn.
+        groups: geom and site groups that are drawn; of the sites, those with a material.
 
     Raises:
         ValueError: for states, times or overlays of the wrong shape, not finite, or out of order,
@@ -170,7 +178,7 @@ def record(
         commands=tuple(draw(model, data, groups).commands),
         overlays=(*(trail(name, track) for name, track in tracks.items()), *over),
         readouts={name: _values(name, v, len(time)) for name, v in (readouts or {}).items()},
-        cameras=dict(cameras or default_cameras(_ball(model, data, groups), tracks)),
+        cameras=dict(cameras or default_cameras(model, _ball(model, data, groups), tracks)),
     )
 
 
@@ -205,6 +213,13 @@ def _visible_geoms(model: mujoco.MjModel, body: int, groups: Sequence[int]) -> l
         for g in range(first, first + model.body_geomnum[body])
         if model.geom_group[g] in groups and color(model, g)[3] > 0.0
     ]
+
+
+def _visible_sites(model: mujoco.MjModel, body: int, groups: Sequence[int]) -> list[int]:
+    shown = (
+        (model.site_bodyid == body) & (model.site_matid >= 0) & np.isin(model.site_group, groups)
+    )
+    return [int(site) for site in np.flatnonzero(shown)]
 
 
 def _locator(model: mujoco.MjModel, name: str) -> tuple[bool, int]:
