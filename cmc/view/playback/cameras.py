@@ -64,7 +64,10 @@ def scene_ball(
 
 
 def default_cameras(
-    model: mujoco.MjModel, ball: tuple[Array, float], trails: dict[str, Array]
+    model: mujoco.MjModel,
+    data: mujoco.MjData,
+    ball: tuple[Array, float],
+    trails: dict[str, Array],
 ) -> dict[str, Camera]:
     """Presets: the whole scene, the model's own fixed cameras, and views of each trail.
 
@@ -72,10 +75,11 @@ def default_cameras(
     """
     presets = {"whole scene": around(*ball)}
     focus = next(iter(trails.values())).mean(axis=0) if trails else ball[0]
+    mujoco.mj_camlight(model, data)
     still = model.body_weldid[model.cam_bodyid] == 0
     for camera in np.flatnonzero(still & (model.cam_mode == mujoco.mjtCamLight.mjCAMLIGHT_FIXED)):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, int(camera))
-        position, ahead = model.cam_pos0[camera], -model.cam_mat0[camera].reshape(3, 3)[:, 2]
+        position, ahead = data.cam_xpos[camera], -data.cam_xmat[camera].reshape(3, 3)[:, 2]
         reach = max(float((focus - position) @ ahead), 0.01)
         preset = Camera(_triple(position), _triple(position + reach * ahead))
         presets[name or f"camera {camera}"] = preset

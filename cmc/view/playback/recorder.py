@@ -178,7 +178,7 @@ def record(
         commands=tuple(draw(model, data, groups).commands),
         overlays=(*(trail(name, track) for name, track in tracks.items()), *over),
         readouts={name: _values(name, v, len(time)) for name, v in (readouts or {}).items()},
-        cameras=dict(cameras or default_cameras(model, _ball(model, data, groups), tracks)),
+        cameras=dict(cameras or default_cameras(model, data, _ball(model, data, groups), tracks)),
     )
 
 
