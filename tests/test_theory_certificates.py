@@ -16,6 +16,7 @@ from cmc.theory.certificates import (
     rate_in,
 )
 from cmc.theory.certify import certify
+from cmc.theory.combinations import feedback
 from cmc.theory.contraction import contraction_rate, rate_from_cloud
 from cmc.theory.exact import Region, closed_loop, total_jacobian
 from cmc.theory.metric_search import search_metric
@@ -424,3 +425,22 @@ def test_torch_policies_are_understood():
     assert not answer.refused
     plain = PositiveNetwork(2, hidden=(8,), seeds=(0, 1))
     assert "bypass" in certify(ModularPolicy(plain), plants.get("lags")).reason
+
+
+def test_complex_pairs_are_certified_with_the_feedback_transform():
+    """T_a = (T_y f_u)^-1 needs no slopes: what is certified is stable at every random state."""
+    plant, rng, held = plants.get("spiral"), np.random.default_rng(9), 0
+    space = feedback(plant.A, plant.B)
+    for _ in range(8):
+        bypass = 10 ** rng.uniform(-1, 0.5, (2, 2))
+        pol = Policy(bypass, bypass * rng.uniform(0.1, 1.5, (2, 2)))
+        answer = certify(pol, plant, transforms=space)
+        held += answer.holds
+        field = closed_loop(pol, plant, lambda y: space)
+        J = total_jacobian(field, rng.normal(size=(300, 4)) * 3)
+        if answer:
+            assert np.linalg.eigvals(J).real.max() < 0
+            to_aux = np.block([[space.T_y, np.zeros((2, 2))], [np.zeros((2, 2)), np.eye(2)]])
+            J = to_aux @ J @ np.linalg.inv(to_aux)
+            assert contraction_rate(J, answer.metric).min() >= answer.rate - 1e-6
+    assert held >= 3

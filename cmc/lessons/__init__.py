@@ -1,0 +1,1 @@
+"""What the pictures of the lessons compute: plain functions from numbers to arrays."""
