@@ -14,7 +14,8 @@ training that is killed and resumed ends with the weights of one that was not.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -128,6 +129,10 @@ class PPO:
             `episode_return` (sum of rewards over `config.steps` steps, mean over trajectories),
             `value_loss`, `clip_fraction`, `std` (S, n).
         """
+        with single_thread():
+            return self._update()
+
+    def _update(self) -> dict[str, Any]:
         c = self.config
         generators = [np.random.default_rng([seed, self.updates]) for seed in self.seeds]
         rollout = collect(
@@ -255,6 +260,17 @@ class PPO:
         with torch.no_grad():
             self.log_std.clamp_(min=c.log_std_floor)
         return {"ratio": ratio, "value_error": error[..., 0]}
+
+
+@contextmanager
+def single_thread() -> Iterator[None]:
+    """Keep torch to one thread: on products this small more threads only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def normalised(advantage: Tensor) -> Tensor:

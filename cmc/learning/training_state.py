@@ -52,15 +52,16 @@ def put(training: Training, state: Mapping[str, np.ndarray]) -> None:
     with torch.no_grad():
         for name, parameter in training.parameters.items():
             parameter.copy_(torch.from_numpy(state[f"weight.{name}"]))
+            shapes = {"step": (), "exp_avg": parameter.shape, "exp_avg_sq": parameter.shape}
             moments = {
-                key: torch.from_numpy(state[f"{key}.{name}"].copy())
-                for key in ("step", "exp_avg", "exp_avg_sq")
+                key: torch.from_numpy(state[f"{key}.{name}"].copy()).reshape(shape)
+                for key, shape in shapes.items()
                 if f"{key}.{name}" in state
             }
             training.optimiser.state.pop(parameter, None)
             if moments:
                 training.optimiser.state[parameter] = moments
-    training.updates = int(state["updates"])
+    training.updates = int(state["updates"].item())
 
 
 def save(training: Training, path: str | Path, record: Mapping[str, Any]) -> None:
