@@ -424,9 +424,10 @@ class View {
   }
 
   play() {
-    const began = performance.now();
+    let began = null; // a repaint's time stamp may lie before the click that asked for it
     const from = this.cursor >= +this.slider.max ? 0 : this.cursor;
     const step = (now) => {
+      began ??= now;
       const last = +this.slider.max;
       this.cursor = Math.min(last, Math.round(from + ((now - began) / 5000) * last));
       this.draw();

@@ -1,0 +1,29 @@
+"""One headless Chromium for all browser tests of a run."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+from find_browser import MISSING, find_browser
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """A headless Chromium; without one the test is skipped, or fails if a browser is required."""
+    required = os.environ.get("CMC_REQUIRE_BROWSER", "0") not in ("", "0")
+    absent = pytest.fail if required else pytest.skip
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        absent("Playwright is not installed: pip install cmc[dev]")
+    path = find_browser()
+    if path is None:
+        absent(MISSING)
+    # Chromium refuses its sandbox to root, and software rendering stands in for a graphics card.
+    root = hasattr(os, "geteuid") and os.geteuid() == 0
+    arguments = ["--enable-unsafe-swiftshader", *(["--no-sandbox"] if root else [])]
+    with sync_playwright() as playwright:
+        running = playwright.chromium.launch(executable_path=path, args=arguments)
+        yield running
+        running.close()
