@@ -111,7 +111,7 @@ def test_transforms_diagonalise_the_model_and_triangulate_the_command(angle):
     np.testing.assert_allclose(
         T_a @ T_a.swapaxes(-1, -2), np.broadcast_to(np.eye(2), T_a.shape), atol=1e-12
     )
-    np.testing.assert_allclose(envs.signal(), (T_y @ envs.error[..., None])[..., 0], atol=1e-12)
+    np.testing.assert_allclose(envs.signal, (T_y @ envs.error[..., None])[..., 0], atol=1e-12)
 
 
 def test_an_auxiliary_action_is_the_identity_action_seen_through_T_a():

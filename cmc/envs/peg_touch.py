@@ -137,20 +137,15 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
         """Integral of the signal, shape (num_envs, 2)."""
         self.command: Array = np.tile(np.asarray(c.u0, dtype=float), (num_envs, 1))
         """Last applied command (u_x, u_z) [m], shape (num_envs, 2)."""
+        self.force: Array = np.zeros(num_envs)
+        """Contact force f [N], shape (num_envs,)."""
+        self.error: Array = np.zeros((num_envs, 2))
+        """Latent tracking error y - y_d, shape (num_envs, 2) [m, N]."""
+        self.signal: Array = np.zeros((num_envs, 2))
+        """What the policy is fed before its integral, T_y e or e, shape (num_envs, 2)."""
         self.steps = np.zeros(num_envs, dtype=np.int64)
         self.sampled: dict[str, Array] = {}
         """Values drawn at reset, name in `SAMPLED` to (num_envs,) array."""
-
-    @property
-    def force(self) -> Array:
-        """Contact force f [N], (num_envs,)."""
-        return self.true_peg.contact_force(self.position[:, 0], self.position[:, 1])
-
-    @property
-    def error(self) -> Array:
-        """Latent tracking error y - y_d, (num_envs, 2) [m, N]."""
-        x_error = self.position[:, 0] - self.sampled["x_d"]
-        return np.stack([x_error, self.force - self.sampled["f_d"]], axis=-1)
 
     def reset(
         self,
@@ -189,7 +184,8 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
         x, z = self.position.T
         x, z = self.true_peg.step(x, z, self.command, c.h)  # exact zero-order hold
         self.position = np.stack([x, z], axis=-1)
-        self.integral = self.integral + c.h * self.signal()
+        self._sense()
+        self.integral = self.integral + c.h * self.signal
         self.steps += 1
         error = np.abs(self.error)
         terms = {
@@ -224,13 +220,16 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
         T_a = np.broadcast_to(self._mount.T, T_y.shape)  # inverse_solution: R = T_y f_u T_a
         return T_y, T_a
 
-    def signal(self) -> Array:
-        """What the policy is fed before its integral: T_y e or e, (num_envs, 2)."""
-        error = self.error
+    def _sense(self) -> None:
+        """Force, error and signal at the present position."""
+        x, z = self.position.T
+        self.force = self.true_peg.contact_force(x, z)
+        error = [x - self.sampled["x_d"], self.force - self.sampled["f_d"]]
+        self.error = np.stack(error, axis=-1)
         if self.config.interface == "auxiliary":
-            x = self.position[:, 0]
-            error[:, 1] += self.nominal_peg.K_sur * self.nominal_peg.surface_slope(x) * error[:, 0]
-        return error
+            shear = self.nominal_peg.K_sur * self.nominal_peg.surface_slope(x)
+            error[1] = error[1] + shear * error[0]  # T_y e, see `transforms`
+        self.signal = np.stack(error, axis=-1)
 
     def _seed(self, seed: int | Sequence[int | None] | None) -> None:
         if isinstance(seed, Sequence):
@@ -264,7 +263,8 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
         self.integral = np.where(mask[:, None], 0.0, self.integral)
         self.steps = np.where(mask, 0, self.steps)
         self.nominal_peg, self.true_peg = self._pegs()
-        self.integral = np.where(mask[:, None], c.h * self.signal(), self.integral)
+        self._sense()
+        self.integral = np.where(mask[:, None], c.h * self.signal, self.integral)
 
     def _pegs(self) -> tuple[Peg, Peg]:
         """The plant the controller believes in, and the one that answers it."""
@@ -292,8 +292,8 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
             s = self.sampled
             columns = [self.position[:, 0], self.force, s["x_d"], s["f_d"]]
         else:
-            signal = self.signal()
-            columns = [signal[:, 0], self.integral[:, 0], signal[:, 1], self.integral[:, 1]]
+            signal, integral = self.signal, self.integral
+            columns = [signal[:, 0], integral[:, 0], signal[:, 1], integral[:, 1]]
         return np.stack(columns, axis=-1).astype(np.float32)
 
     def _privileged(self) -> NDArray[np.float32]:
