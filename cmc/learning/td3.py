@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from cmc.learning.replay import Batch
@@ -73,6 +74,7 @@ class TD3:
         action: size of an action.
         config: settings.
         stream: separates learners that share their seeds (two levels, say).
+        scale: what observations are multiplied with before the critics see them, (observation,).
     """
 
     def __init__(
@@ -83,9 +85,11 @@ class TD3:
         action: int,
         config: TD3Config,
         stream: int = 0,
+        scale: ArrayLike = 1.0,
     ) -> None:
         self.config, self.seeds = config, tuple(seeds)
         self.actor = actor
+        self._scale = torch.tensor(np.broadcast_to(scale, (observation,)), dtype=torch.float32)
         own = [seed * 1009 + stream for seed in seeds]
         self.critics = StackedMLP(
             observation + action, 1, config.critic_hidden, copies=2, seeds=own, start="signed"
@@ -101,7 +105,7 @@ class TD3:
 
     def values(self, critics: StackedMLP, observation: Tensor, action: Tensor) -> Tensor:
         """Both critics' values, (seeds, 2, batch)."""
-        x = torch.cat([observation, action], dim=-1).repeat_interleave(2, dim=0)
+        x = torch.cat([observation * self._scale, action], dim=-1).repeat_interleave(2, dim=0)
         return critics(x)[..., 0].reshape(len(self.seeds), 2, -1)
 
     def update(self, batch: Batch) -> dict[str, np.ndarray]:
@@ -167,12 +171,16 @@ class TD3:
                 by_seed.mul_((bound / norm.clamp(min=1e-12)).clamp(max=1.0))
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """All that is needed to continue: weights, targets, Adam, counter, generators."""
+        """All that is needed to continue: weights, targets, Adam, counter, generators.
+
+        Weights are taken as they are, not through `state_dict`, which shows those of positive
+        networks by absolute value and would lose the sign that Adam's moments belong to.
+        """
         modules = (self.actor, self.critics, self.target_actor, self.target_critics)
         arrays = {
-            f"{name}.{key}": value.numpy().copy()
+            f"{name}.{key}": value.detach().numpy().copy()
             for name, module in zip(_MODULES, modules, strict=True)
-            for key, value in module.state_dict().items()
+            for key, value in module.named_parameters()
         }
         for name, adam in (("actor_adam", self.actor_adam), ("critic_adam", self.critic_adam)):
             for index, slots in adam.state_dict()["state"].items():
@@ -183,8 +191,11 @@ class TD3:
     def restore(self, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:
         """Continue from `state`."""
         modules = (self.actor, self.critics, self.target_actor, self.target_critics)
-        for name, module in zip(_MODULES, modules, strict=True):
-            module.load_state_dict(_part(arrays, name))
+        with torch.no_grad():
+            for name, module in zip(_MODULES, modules, strict=True):
+                saved = _part(arrays, name)
+                for key, parameter in module.named_parameters():
+                    parameter.copy_(saved[key])
         for name, adam in (("actor_adam", self.actor_adam), ("critic_adam", self.critic_adam)):
             slots: dict[int, dict[str, Tensor]] = {}
             for key, value in _part(arrays, name).items():

@@ -1,0 +1,284 @@
+"""Two levels at two rates: a planner sets sub-goals, a low level pursues them.
+
+The planner acts once a segment (`horizon` ticks) and learns by TD3 from (observation, sub-goal,
+mean reward of the segment, next observation). The low level acts at every tick; its integral starts
+anew with every sub-goal. All worlds of all seeds move in step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cmc import store
+from cmc.envs.panda_task import CRITIC, PandaTask
+from cmc.learning.low_level import LowLevel, Segment, evaluate, under
+from cmc.learning.replay import Replay
+from cmc.learning.td3 import TD3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HierarchyConfig:
+    """Rates and sizes of the two levels.
+
+    Attributes:
+        worlds: worlds of each seed (our choice).
+        samples: environment steps of a seed between rounds of updates (`tab:para`: 1024). Updates
+            are spread evenly over the segments.
+        high_updates: planner updates for each round (`tab:para`: 100).
+        low_updates: low-level updates for each round.
+        high_noise: standard deviation of the planner's noise, in half-ranges (our choice).
+        warm_up: environment steps of a seed with random sub-goals and no learning (our choice).
+        reward_scale: factor on the mean reward of a segment (our choice).
+        capacity: segments that the planner remembers (`tab:para`: 65536).
+    """
+
+    worlds: int = 8
+    samples: int = 1024
+    high_updates: int = 100
+    low_updates: int = 100
+    high_noise: float = 0.3
+    warm_up: int = 10_000
+    reward_scale: float = 1.0
+    capacity: int = 65536
+
+    def __post_init__(self) -> None:
+        if min(self.worlds, self.samples, self.capacity) < 1:
+            raise ValueError(f"worlds, samples and capacity must be at least 1: {self}")
+        if min(self.high_updates, self.low_updates, self.warm_up) < 0:
+            raise ValueError(f"updates and warm_up must not be negative: {self}")
+
+
+@dataclass(frozen=True)
+class Planning:
+    """How a task's observations and sub-goals are normalized for the planner.
+
+    Attributes:
+        shift, scale: observation fields of the planner to (field - shift) * scale, by name; fields
+            that are not named stay as they are.
+        low, high: ends of the sub-goal's range, which the planner's [-1, 1] is mapped to.
+    """
+
+    shift: Mapping[str, Array]
+    scale: Mapping[str, Array]
+    low: Array
+    high: Array
+
+    def observe(self, task: PandaTask, observation: Array) -> Array:
+        """The planner's normalized view of observations (..., size)."""
+        parts = [
+            (observation[..., task.layout[name]] - self.shift.get(name, np.zeros(1)))
+            * self.scale.get(name, np.ones(1))
+            for name in task.high_level
+        ]
+        return np.concatenate(parts, axis=-1)
+
+    def subgoal(self, action: Array) -> Array:
+        """Sub-goal in the task's units from an action in [-1, 1]."""
+        return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
+
+
+class TwoLevel:
+    """Trains a planner and a low level on one task, several seeds side by side.
+
+    Args:
+        task: len(seeds) * config.worlds worlds, those of a seed side by side.
+        seeds: one integer for each seed.
+        planner: TD3 on the planner's normalized observations.
+        low: the low level.
+        planning: normalization.
+        config: rates and sizes.
+    """
+
+    def __init__(
+        self,
+        task: PandaTask,
+        seeds: Sequence[int],
+        planner: TD3,
+        low: LowLevel,
+        planning: Planning,
+        config: HierarchyConfig,
+    ) -> None:
+        if task.num != len(seeds) * config.worlds:
+            raise ValueError(f"wanted {len(seeds)} x {config.worlds} worlds, got {task.num}")
+        if task.config.ticks % task.config.horizon:
+            raise ValueError("an episode must hold a whole number of segments")
+        self.task, self.seeds, self.config = task, tuple(seeds), config
+        self.planner, self.low, self.planning = planner, low, planning
+        self.shape = (len(seeds), config.worlds)
+        self.steps = 0  # environment steps of each seed
+        self._generators = [np.random.default_rng([seed, 1, 17]) for seed in seeds]
+        task.seed([1_000_003 * seed + k for seed in seeds for k in range(config.worlds)])
+        self._obs = task.reset()
+        size = planning.observe(task, self._obs).shape[-1]
+        self.replay = Replay(seeds, size, len(planning.low), config.capacity, stream=1)
+
+    def train(
+        self,
+        steps: int,
+        callback: Callable[[dict[str, Any]], object] | None = None,
+        checkpoint: str | Path | None = None,
+        every: int = 50_000,
+        record: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Go on until each seed has made `steps` environment steps.
+
+        Args:
+            steps: of each seed, in all.
+            callback: called after every segment with `steps` and `reward` (seeds,); what it
+                returns is ignored.
+            checkpoint: if given, the state is read from this file if it is there and written to it
+                every `every` steps and at the end, also when interrupted.
+            every: steps between checkpoints.
+            record: study, method and configuration that the checkpoint must carry.
+        """
+        if checkpoint is not None and Path(checkpoint).exists():
+            self.load(checkpoint, record or {})
+        saved = self.steps
+        try:
+            while self.steps < steps:
+                reward = self.segment()
+                if callback is not None:
+                    callback({"steps": self.steps, "reward": reward})
+                if checkpoint is not None and self.steps - saved >= every:
+                    self.save(checkpoint, record or {})
+                    saved = self.steps
+        finally:
+            if checkpoint is not None and self.steps > saved and not self._broken:
+                self.save(checkpoint, record or {})
+
+    _broken = False  # set while a segment is under way: such a state is not saved
+
+    def segment(self) -> Array:
+        """One sub-goal, its ticks, and the updates that are due; mean rewards (seeds,)."""
+        self._broken = True
+        task, planning = self.task, self.planning
+        seen = planning.observe(task, self._obs)
+        action = self._choose(self._split(seen))
+        obs = task.set_subgoal(planning.subgoal(self._join(action)))
+        segment, reward, self._obs, over = rollout(task, self.low, obs, self.shape, explore=True)
+        following = planning.observe(task, self._obs)
+        gain = self.config.reward_scale * reward
+        # An episode ends by its time limit only: the next value always counts.
+        self.replay.add(self._split(seen), action, gain, self._split(following), np.ones_like(gain))
+        self.low.record(segment)
+        before = self.steps
+        self.steps += task.config.horizon * self.config.worlds
+        self._learn(before)
+        if over:
+            self._obs = task.reset()
+        self._broken = False
+        return reward.mean(1)
+
+    def _choose(self, seen: Array) -> Array:
+        """The planner's action with noise, or a random one at first; (seeds, worlds, size)."""
+        count = (self.config.worlds, len(self.planning.low))
+        if self.steps < self.config.warm_up:
+            return np.stack([g.uniform(-1.0, 1.0, count) for g in self._generators])
+        noise = np.stack([g.standard_normal(count) for g in self._generators])
+        action = evaluate(self.planner.actor, seen) + self.config.high_noise * noise
+        return np.clip(action, -1.0, 1.0)
+
+    def _learn(self, before: int) -> None:
+        """Updates that fell due between two step counts, both levels."""
+        config, start = self.config, self.config.warm_up
+        rounds = [max(count - start, 0) / config.samples for count in (before, self.steps)]
+        for _ in range(int(rounds[1] * config.high_updates) - int(rounds[0] * config.high_updates)):
+            self.planner.update(self.replay.sample(self.planner.config.batch))
+        for _ in range(int(rounds[1] * config.low_updates) - int(rounds[0] * config.low_updates)):
+            self.low.update()
+
+    def _split(self, array: Array) -> Array:
+        return array.reshape(*self.shape, *array.shape[1:])
+
+    def _join(self, array: Array) -> Array:
+        return array.reshape(-1, *array.shape[2:])
+
+    def save(self, path: str | Path, record: Mapping[str, Any]) -> None:
+        """Write everything that decides what follows, atomically."""
+        arrays: dict[str, np.ndarray] = {}
+        state: dict[str, Any] = {"steps": self.steps, "hierarchy": asdict(self.config)}
+        planner, replay, low = self.planner.state(), self.replay.state(), self.low.state()
+        for name, part in (("planner", planner), ("replay", replay), ("low", low)):
+            tensors, state[name] = part
+            arrays |= {f"{name}/{key}": value for key, value in tensors.items()}
+        world = self.task.snapshot()
+        state["streams"] = world.pop("streams")
+        state["noise"] = [g.bit_generator.state for g in self._generators]
+        arrays |= {f"task/{key}": value for key, value in world.items()}
+        store.save_checkpoint(
+            path,
+            arrays,
+            {"study": "none", "method": "none", **record, "seeds": list(self.seeds), "kind":
+             "training", "state": state},
+        )  # fmt: skip
+
+    def load(self, path: str | Path, record: Mapping[str, Any]) -> None:
+        """Continue from `save`.
+
+        Raises:
+            CheckpointError: if the file is damaged or of another training.
+        """
+        arrays, found = store.load_checkpoint(path)
+        wanted = {**record, "seeds": list(self.seeds), "kind": "training"}
+        for key, value in wanted.items():
+            if found.get(key) != value:
+                raise store.CheckpointError(
+                    f"{path}: wanted a training with {key} {value!r}, found {found.get(key)!r}"
+                )
+        state = found["state"]
+        if state["hierarchy"] != asdict(self.config):
+            raise store.CheckpointError(f"{path}: was trained with {state['hierarchy']}")
+        self.planner.restore(under(arrays, "planner/"), state["planner"])
+        self.replay.restore(under(arrays, "replay/"), state["replay"])
+        self.low.restore(under(arrays, "low/"), state["low"])
+        world = {**under(arrays, "task/"), "streams": state["streams"]}
+        self._obs = self.task.restore(world)
+        for generator, kept in zip(self._generators, state["noise"], strict=True):
+            generator.bit_generator.state = kept
+        self.steps = int(state["steps"])
+
+
+def rollout(
+    task: PandaTask, low: LowLevel, obs: Array, shape: tuple[int, int], explore: bool
+) -> tuple[Segment, Array, Array, bool]:
+    """Run the low level until the next sub-goal is due.
+
+    Args:
+        task: with its sub-goals just set, and `obs` observed after that.
+        low: the low level.
+        obs: (worlds, size).
+        shape: (seeds, worlds of each).
+        explore: whether the low level explores.
+
+    Returns:
+        The segment, mean rewards (seeds, worlds), the last observations, whether time is up.
+    """
+    views, actions, forces = [], [], []
+    terms: dict[str, list[Array]] = {}
+    total = np.zeros(task.num)
+    limit = np.array(task.config.u_limit)
+    over = False
+    seen = task.select(obs, CRITIC).reshape(*shape, -1)
+    views.append(seen)
+    for _ in range(task.config.horizon):
+        action = low.act(seen, explore)
+        obs, reward, _, truncated, info = task.step(action.reshape(task.num, -1) * limit)
+        total += reward
+        seen = task.select(obs, CRITIC).reshape(*shape, -1)
+        views.append(seen)
+        actions.append(action)
+        forces.append(info["contact_force_max"].reshape(shape))
+        for name, value in info["tracking_terms"].items():
+            terms.setdefault(name, []).append(value.reshape(shape))
+        over = bool(truncated[0])
+    tracking = {name: np.stack(values) for name, values in terms.items()}
+    segment = Segment(np.stack(views), np.stack(actions), tracking, np.stack(forces))
+    return segment, (total / task.config.horizon).reshape(shape), obs, over

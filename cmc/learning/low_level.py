@@ -1,0 +1,210 @@
+"""Low levels of a hierarchy: what turns (y, integral of y) into an action, and how it is learned.
+
+Every low level acts on observations (seeds, worlds, size) whose first 2n entries are the latent
+signals y and their integrals, and answers actions in [-1, 1]. `record` receives whole segments (the
+ticks between two sub-goals), `update` learns from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from cmc.learning.replay import Replay
+from cmc.learning.td3 import TD3
+from cmc.policies import PositiveNetwork, tanh
+
+Array = NDArray[np.float64]
+State = tuple[dict[str, np.ndarray], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Segment:
+    """The ticks of every world between two sub-goals; T ticks, N worlds of each seed.
+
+    Attributes:
+        observation: before each tick, and after the last, (T + 1, seeds, N, size).
+        action: (T, seeds, N, n), in [-1, 1].
+        tracking: minus the distances to the sub-goal, by name, (T, seeds, N).
+        force: largest contact force of each tick, (T, seeds, N), N.
+    """
+
+    observation: Array
+    action: Array
+    tracking: dict[str, Array]
+    force: Array
+
+
+class LowLevel(Protocol):
+    """What a hierarchy asks of its low level."""
+
+    def act(self, observation: Array, explore: bool) -> Array:
+        """Actions in [-1, 1], (seeds, N, n)."""
+
+    def record(self, segment: Segment) -> None:
+        """Receive a finished segment."""
+
+    def update(self) -> None:
+        """One learning step."""
+
+    def state(self) -> State:
+        """All that is needed to continue."""
+
+    def restore(self, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:
+        """Continue from `state`."""
+
+
+class ModularActor(nn.Module):
+    """u_i = tanh(pi_i(y_i, integral of y_i)): one network per dimension, bounded by 1.
+
+    The last tanh has a slope of at most 1, so bounds on the slopes of pi hold for u too.
+
+    Args:
+        net: maps s (seeds, batch, n, 2) to (seeds, batch, n).
+        n: number of dimensions.
+    """
+
+    def __init__(self, net: nn.Module, n: int) -> None:
+        super().__init__()
+        self.net, self.n = net, n
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Actions (seeds, batch, n) from observations (seeds, batch, at least 2n)."""
+        s = observation[..., : 2 * self.n].unflatten(-1, (2, self.n)).transpose(-1, -2)
+        return tanh(self.net(s))
+
+
+@torch.no_grad()
+def set_gain(net: PositiveNetwork, gain: Array) -> None:
+    """Scale the last layers so that the slope bound in y is `gain` (n,), below any cap."""
+    bound = torch.as_tensor(net.slope_bounds()[1][..., 0])  # (seeds, n)
+    factor = torch.as_tensor(gain) / bound
+    last = net.mlp.weights[-1]
+    last.mul_(factor.reshape(-1, 1, 1).to(last.dtype))
+
+
+class Fixed:
+    """A low level that does not learn: any actor, or None for no action at all."""
+
+    def __init__(self, actor: nn.Module | None, n: int = 6) -> None:
+        self.actor, self.n = actor, n
+
+    def act(self, observation: Array, explore: bool) -> Array:
+        """See `LowLevel.act`; nothing is explored."""
+        if self.actor is None:
+            return np.zeros((*observation.shape[:-1], self.n))
+        return evaluate(self.actor, observation)
+
+    def record(self, segment: Segment) -> None:
+        """Nothing is kept."""
+
+    def update(self) -> None:
+        """Nothing is learned."""
+
+    def state(self) -> State:
+        """The actor's weights."""
+        if self.actor is None:
+            return {}, {}
+        return {k: v.detach().numpy().copy() for k, v in self.actor.named_parameters()}, {}
+
+    def restore(self, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:
+        """Put the actor's weights back."""
+        with torch.no_grad():
+            for name, parameter in self.actor.named_parameters() if self.actor else ():
+                parameter.copy_(torch.from_numpy(arrays[name]))
+
+
+class CriticLow:
+    """A low level that learns from a critic, as the paper's does.
+
+    Args:
+        agent: actor and critics; the critics see the first `agent` observation entries.
+        seeds: one integer for each seed.
+        size: how many leading entries of an observation the critics see.
+        noise: standard deviation of the exploration noise.
+        whole_return: whether the critics learn the rest of the segment's return as it came (the
+            segment ends there) instead of one-step targets; the segment's end is terminal in both.
+        weights: what each tracking term counts.
+        capacity: ticks kept for each seed.
+    """
+
+    def __init__(
+        self,
+        agent: TD3,
+        seeds: Sequence[int],
+        size: int,
+        *,
+        noise: float,
+        whole_return: bool,
+        weights: dict[str, float],
+        n: int = 6,
+        capacity: int = 65536,
+    ) -> None:
+        self.agent, self.size, self.noise = agent, size, noise
+        self.whole_return, self.weights = whole_return, weights
+        self.replay = Replay(seeds, size, n, capacity, stream=2)
+        self._generators = [np.random.default_rng([seed, 2, 17]) for seed in seeds]
+
+    def act(self, observation: Array, explore: bool) -> Array:
+        """See `LowLevel.act`; exploration adds Gaussian noise."""
+        action = evaluate(self.agent.actor, observation)
+        if explore:
+            shape = action.shape[1:]
+            noise = np.stack([g.standard_normal(shape) for g in self._generators])
+            action = np.clip(action + self.noise * noise, -1.0, 1.0)
+        return action
+
+    def record(self, segment: Segment) -> None:
+        """Store every tick of the segment, with its reward or with its return to go."""
+        reward = sum(weight * segment.tracking[name] for name, weight in self.weights.items())
+        continues = np.ones_like(reward)
+        continues[-1] = 0.0
+        if self.whole_return:
+            reward = np.cumsum(reward[::-1], axis=0)[::-1]
+            continues[:] = 0.0
+        seen = segment.observation[..., : self.size]
+        parts = (seen[:-1], segment.action, reward, seen[1:], continues)
+        self.replay.add(*(_flat(part) for part in parts))
+
+    def update(self) -> None:
+        """One step of the critics, and every other time of the actor."""
+        self.agent.update(self.replay.sample(self.agent.config.batch))
+
+    def state(self) -> State:
+        """Agent, memory and noise."""
+        agent, agent_record = self.agent.state()
+        replay, replay_record = self.replay.state()
+        arrays = {f"agent/{k}": v for k, v in agent.items()}
+        arrays |= {f"replay/{k}": v for k, v in replay.items()}
+        noise = [g.bit_generator.state for g in self._generators]
+        return arrays, {"agent": agent_record, "replay": replay_record, "noise": noise}
+
+    def restore(self, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:
+        """Continue from `state`."""
+        self.agent.restore(under(arrays, "agent/"), record["agent"])
+        self.replay.restore(under(arrays, "replay/"), record["replay"])
+        for generator, state in zip(self._generators, record["noise"], strict=True):
+            generator.bit_generator.state = state
+
+
+@torch.no_grad()
+def evaluate(actor: nn.Module, observation: Array) -> Array:
+    """The actor's output as an array of floats."""
+    return actor(torch.from_numpy(observation.astype(np.float32))).numpy().astype(np.float64)
+
+
+def under(arrays: dict[str, np.ndarray], start: str) -> dict[str, np.ndarray]:
+    """Entries whose name has the given start, without it."""
+    return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}
+
+
+def _flat(part: Array) -> Array:
+    """(T, seeds, N, ...) to (seeds, T N, ...)."""
+    moved = np.moveaxis(part, 1, 0)
+    return moved.reshape(moved.shape[0], -1, *moved.shape[3:])
