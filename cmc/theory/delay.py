@@ -194,8 +194,9 @@ def simulate(
     *,
     limit: float = np.inf,
     noise: ArrayLike | None = None,
+    start: float = 1.0,
 ) -> Iterator[Array]:
-    """Run many delayed loops at once from e = 1, yielding the errors e_k.
+    """Run many delayed loops at once, yielding the errors e_k.
 
     The lag is integrated exactly from event to event (sample, arrival of the late command).
 
@@ -206,6 +207,7 @@ def simulate(
         steps: number of samples.
         limit: the command is limit * tanh(raw / limit); infinite means linear.
         noise: added to what the policy sees of the error, (steps, ...).
+        start: e_0; no integral and no command before it.
 
     Raises:
         ValueError: if `limit` or `steps` is not positive.
@@ -218,7 +220,7 @@ def simulate(
     keep_new = np.exp(-(1.0 - fraction) * loop.period / loop.tau)
     length = int(whole.max()) + 2
     sent = np.zeros((length, *delays.shape))  # ring of past commands
-    error, integral = np.ones(delays.shape), np.zeros(delays.shape)
+    error, integral = np.full(delays.shape, float(start)), np.zeros(delays.shape)
     for k in range(steps):
         yield error
         seen = error if noise is None else error + np.asarray(noise)[k]
