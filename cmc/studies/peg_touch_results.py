@@ -31,7 +31,7 @@ Planned = tuple[int | None, str, float]
 SPARSE = (1000, 5000, 10_000, 15_000)
 SAMPLE_TIMES = (0.002, 0.005, 0.01, 0.02, 0.03)
 """Control periods of the test of the sampled-data bound [s]; training has 0.01."""
-DENSE = ("cppo", "ppo", "cppo_capped", "ppo_stress", "cppo_stress")
+DENSE = ("cppo", "ppo", "cppo_capped", "ppo_stress", "cppo_stress", "ppo_joint", "ppo_raw")
 """Methods tested at every kept policy; the others at `SPARSE`."""
 TIMED = ("cppo", "ppo", "cppo_capped", "cppo_bounded")
 """Methods tested with other control periods."""
@@ -119,7 +119,7 @@ def evaluate_method(
     answer: dict[str, Any] = {"title": arm.title, "seeds": [], "tests": [], "training": {}}
     if arm.trained:
         episodes, returns = learning_curve(name, path)
-        size = max(1, 240 // study.episodes_per_update)
+        size = min(240 // study.episodes_per_update, len(returns))
         count = len(returns) // size
         smooth = returns[: count * size].reshape(count, size, -1).mean(axis=1)
         answer["training"] = {
