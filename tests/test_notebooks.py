@@ -1,0 +1,260 @@
+"""Every notebook has the course's skeleton, and its exercise a stub that fails and a solution."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import re
+import runpy
+from pathlib import Path
+
+import nbformat
+import pytest
+
+from cmc import exercises
+
+ROOT = Path(__file__).resolve().parent.parent
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+FIRST = ["What you will learn", "See it fail", "The equations"]
+LAST = ["Questions", "Exercise", "What to remember", "Links"]
+LONGEST = 15
+
+
+def by_notebook(test):
+    return pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)(test)
+
+
+def read(path):
+    return nbformat.read(path, as_version=4)
+
+
+def code(path):
+    return [cell for cell in read(path).cells if cell.cell_type == "code"]
+
+
+def prose(path):
+    text = "\n\n".join(cell.source for cell in read(path).cells if cell.cell_type == "markdown")
+    return re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def section(path, name):
+    return re.split(r"^## ", prose(path).split(f"\n## {name}\n")[1], flags=re.MULTILINE)[0]
+
+
+def calls(tree, name):
+    """Calls of `name(...)` or `anything.name(...)`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            called = node.func
+            if (getattr(called, "attr", None) or getattr(called, "id", None)) == name:
+                yield node
+
+
+def test_the_course_has_lessons():
+    numbers = [int(path.name[:2]) for path in NOTEBOOKS]
+    assert numbers == list(range(len(numbers)))
+
+
+@by_notebook
+def test_the_file_is_clean(path):
+    notebook = read(path)
+    nbformat.validate(notebook)
+    assert notebook.metadata.kernelspec.name == "python3"
+    assert len({cell.id for cell in notebook.cells}) == len(notebook.cells)
+    for cell in code(path):
+        assert cell.outputs == []
+        assert cell.execution_count is None
+        assert set(cell.metadata) <= {"tags"}
+
+
+@by_notebook
+def test_the_skeleton(path):
+    text = prose(path)
+    assert re.match(rf"# {path.name[:2]} · \S", text), "the title should read '# NN · Title'"
+    headings = re.findall(r"^## (.+)$", text, flags=re.MULTILINE)
+    assert headings[: len(FIRST)] == FIRST
+    assert headings[-len(LAST) :] == LAST
+    assert len(re.findall(r"^# ", text, flags=re.MULTILINE)) == 1
+    learn = section(path, "What you will learn")
+    assert re.search(r"\*\*Time\*\* .*\d+ min.*\*\*Prerequisites\*\* .*\*\*Paper\*\* ", learn)
+    assert 3 <= section(path, "What to remember").count("\n- ") <= 6
+
+
+@by_notebook
+def test_two_questions_with_folded_answers(path):
+    questions = section(path, "Questions")
+    assert questions.count("<details><summary>Answer</summary>") == 2
+    text = prose(path)
+    assert text.count("<details>") == text.count("</details>") == text.count("<summary>")
+
+
+@by_notebook
+def test_code_cells_are_short(path):
+    for cell in code(path):
+        length = len(cell.source.splitlines())
+        assert length <= LONGEST, f"{length} lines: {cell.source[:60]!r} ..."
+
+
+@by_notebook
+def test_a_described_figure_comes_before_the_first_slider(path):
+    sources = [cell.source for cell in code(path)]
+    figures = [k for k, source in enumerate(sources) if list(calls(ast.parse(source), "describe"))]
+    sliders = [k for k, source in enumerate(sources) if list(calls(ast.parse(source), "explore"))]
+    assert figures, "no figure is described"
+    if sliders:
+        assert figures[0] < sliders[0]
+
+
+@by_notebook
+def test_every_slider_calls_a_function_that_a_test_calls_too(path):
+    tests = "\n".join(file.read_text() for file in (ROOT / "tests").glob("test_*.py"))
+    for cell in code(path):
+        for call in calls(ast.parse(cell.source), "explore"):
+            callback = call.args[0]
+            assert isinstance(callback, ast.Attribute), "callbacks live in cmc.lessons"
+            assert re.search(rf"\b{callback.attr}\b", tests), f"{callback.attr} is not tested"
+
+
+@by_notebook
+def test_links_lead_to_files(path):
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", prose(path)):
+        if "://" not in target:
+            assert (path.parent / target).is_file(), target
+
+
+def test_the_first_notebook_links_to_all_others():
+    text = prose(NOTEBOOKS[0])
+    for path in NOTEBOOKS[1:]:
+        assert f"({path.name})" in text
+
+
+def stubs(path):
+    found = [cell for cell in code(path) if "raise NotImplementedError" in cell.source]
+    assert found, "no exercise"
+    return found
+
+
+@by_notebook
+def test_stubs_are_tagged_and_raise(path):
+    imports = [
+        node
+        for cell in code(path)
+        for node in ast.parse(cell.source).body
+        if isinstance(node, ast.Import | ast.ImportFrom)
+    ]
+    for cell in stubs(path):
+        assert "raises-exception" in cell.metadata.get("tags", [])
+        space: dict = {}
+        exec(compile(ast.Module(imports, []), str(path), "exec"), space)
+        with pytest.raises(NotImplementedError):
+            exec(compile(cell.source, str(path), "exec"), space)
+
+
+@by_notebook
+def test_solutions_pass_where_stubs_fail(path):
+    solution = runpy.run_path(str(path.parent / "solutions" / f"{path.stem}.py"))
+    checked = set()
+    for cell in stubs(path):
+        tree = ast.parse(cell.source)
+        space: dict = {}
+        definitions = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
+        exec(compile(ast.Module(definitions, []), str(path), "exec"), space)
+        for call in calls(tree, "check"):
+            name, answer = ast.literal_eval(call.args[0]), call.args[1].id
+            with pytest.raises(NotImplementedError):
+                exercises.check(name, space[answer])
+            assert repr(exercises.check(name, solution[answer])) == f"Passed: {name}"
+            checked.add(name)
+    assert checked == set(exercises.names(path.name[:2])), "each check of the lesson is used"
+
+
+# ---- the search of executed notebooks that the root conftest.py adds to nbmake
+
+
+@pytest.fixture(scope="module")
+def search():
+    specification = importlib.util.spec_from_file_location("root_conftest", ROOT / "conftest.py")
+    module = importlib.util.module_from_spec(specification)
+    from nbmake.nb_run import NotebookRun
+
+    wrapped = NotebookRun.execute
+    specification.loader.exec_module(module)
+    NotebookRun.execute = wrapped  # loading it again would wrap it twice
+    return module
+
+
+PICTURE = {"output_type": "display_data", "metadata": {}, "data": {"image/png": "aa"}}
+
+
+def executed(*outputs, tags=(), state=None):
+    cell = nbformat.v4.new_code_cell("pass", outputs=list(map(nbformat.from_dict, outputs)))
+    cell.metadata["tags"] = list(tags)
+    notebook = nbformat.v4.new_notebook(cells=[cell])
+    if state is not None:
+        notebook.metadata["widgets"] = {
+            "application/vnd.jupyter.widget-state+json": {"state": {"id": {"state": state}}}
+        }
+    return notebook
+
+
+ERROR = {"output_type": "error", "ename": "ZeroDivisionError", "evalue": "zero", "traceback": []}
+
+
+@pytest.mark.parametrize(
+    ("notebook", "message"),
+    [
+        (executed(tags=["raises-exception"]), "raised nothing"),
+        (executed(PICTURE), "a figure without plots.describe"),
+        (
+            executed(
+                {
+                    "output_type": "stream",
+                    "name": "stderr",
+                    "text": "Traceback (most recent call last): a",
+                }
+            ),
+            "a traceback was printed",
+        ),
+        (executed(state={"error": "ValueError: no"}), "a picture shows ValueError: no"),
+        (executed(state={"outputs": [ERROR]}), "shows ZeroDivisionError: zero"),
+        (
+            executed(state={"outputs": [{"text": "Traceback (most recent call last): b"}]}),
+            "an output widget shows a traceback",
+        ),
+    ],
+)
+def test_hidden_errors_are_found(search, notebook, message):
+    (found,) = search.hidden_errors(notebook)
+    assert message in found
+
+
+def test_a_healthy_notebook_has_none(search):
+    described = {**PICTURE, "data": {"image/png": "aa", "text/plain": "Figure: A line."}}
+    assert search.hidden_errors(executed(described, state={"error": "", "outputs": []})) == []
+    assert search.hidden_errors(executed(ERROR, tags=["raises-exception"])) == []
+
+
+def test_nbmake_fails_a_notebook_for_an_error_in_a_callback(tmp_path):
+    """End to end: the callback fails after its cell has passed."""
+    from nbmake.nb_run import NotebookRun
+
+    source = """
+from cmc.view import sliders as ui
+
+def callback(k):
+    return {"t": [0.0, 1.0], "y": [k, 1 / (k - 3)]}
+
+picture = ui.panel(ui.lines("t", "y"), x="t", y="y")
+live = ui.explore(callback, picture, k=ui.slider(0, 5), describe="d")
+"""
+    cells = [nbformat.v4.new_code_cell(source), nbformat.v4.new_code_cell("import asyncio")]
+    move = 'live.controls["k"].value = VALUE\nawait asyncio.sleep(0.05)'
+    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    verdicts = {}
+    for value in (4, 3):
+        last = nbformat.v4.new_code_cell(move.replace("VALUE", str(value)))
+        notebook = nbformat.v4.new_notebook(cells=[*cells, last], metadata={"kernelspec": kernel})
+        nbformat.write(notebook, tmp_path / "moved.ipynb")
+        verdicts[value] = NotebookRun(tmp_path / "moved.ipynb", 60).execute().error
+    assert verdicts[4] is None
+    assert "ZeroDivisionError: division by zero (at k = 3)" in verdicts[3].summary
