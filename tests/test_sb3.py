@@ -1,0 +1,143 @@
+"""Stable-Baselines3 policy classes: the same promises, the same learning, save and load."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+
+pytest.importorskip("stable_baselines3")
+
+from stable_baselines3 import PPO as SB3PPO
+from stable_baselines3.common.callbacks import BaseCallback
+
+from cmc.envs.peg_touch import PegTouchEnv, PegTouchVectorEnv
+from cmc.learning.ppo import PPO, PPOConfig
+from cmc.policies import ModularPolicy, NegativeWeightError, PositiveNetwork
+from cmc.sb3 import (
+    BatchedVecEnv,
+    ContractingPolicy,
+    ConvexGradientPolicy,
+    IndependentPolicy,
+)
+
+UPDATES = 40
+CONFIG = PPOConfig(critic_hidden=(32, 32))
+KWARGS = {"log_std_init": CONFIG.log_std_start, "net_arch": {"pi": [16, 16], "vf": [32, 32]}}
+ALIKE = {"n_steps": 50, "batch_size": 200, "n_epochs": 4, "learning_rate": CONFIG.learning_rate}
+
+
+class WithoutPrivileged(PegTouchVectorEnv):
+    """The critic sees the observation alone, as it does in Stable-Baselines3."""
+
+    def reset(self, **kwargs):
+        return super().reset(**kwargs)[0], {}
+
+    def step(self, actions):
+        *result, info = super().step(actions)
+        return *result, {"final_obs": info["final_obs"]} if "final_obs" in info else {}
+
+
+class Returns(BaseCallback):
+    def __init__(self):
+        super().__init__()
+        self.history = []
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        self.history.append(np.mean([e["r"] for e in list(self.model.ep_info_buffer)[-16:]]))
+
+
+def test_learns_as_ours_does():
+    torch.set_num_threads(1)
+    returns = Returns()
+    env = BatchedVecEnv(PegTouchVectorEnv(num_envs=16))
+    model = SB3PPO(ContractingPolicy, env, policy_kwargs=KWARGS, seed=0, device="cpu", **ALIKE)
+    model.learn(16 * 50 * UPDATES, callback=returns)
+    history, seeds = [], [0, 1, 2]
+    policy = ModularPolicy(PositiveNetwork(2, seeds=seeds, hidden=(16, 16)))
+    ppo = PPO(WithoutPrivileged(num_envs=16 * len(seeds)), policy, seeds, CONFIG)
+    ppo.train(UPDATES, lambda row: history.append(row["episode_return"]))
+    assert len(returns.history) == len(history) == UPDATES
+    first, ours = np.mean(history[:5]), np.mean(history[-5:], axis=0)
+    theirs = np.mean(returns.history[-5:])
+    assert min(theirs, ours.min()) > first + 6.0  # all have learnt
+    assert abs(theirs - ours.mean()) < 3.0 * max(ours.std(ddof=1), 3.0)
+
+
+@pytest.mark.parametrize("kind", [ContractingPolicy, IndependentPolicy, ConvexGradientPolicy])
+def test_save_and_load(tmp_path, kind):
+    model = SB3PPO(kind, PegTouchEnv(), n_steps=64, policy_kwargs=KWARGS, device="cpu", seed=3)
+    model.learn(128)
+    observation = np.random.default_rng(0).standard_normal((9, 4)).astype(np.float32)
+    before = model.predict(observation, deterministic=True)[0]
+    model.save(tmp_path / "model.zip")
+    again = SB3PPO.load(tmp_path / "model.zip", device="cpu")
+    assert isinstance(again.policy, kind)
+    np.testing.assert_array_equal(again.predict(observation, deterministic=True)[0], before)
+    model.policy.save(tmp_path / "policy.pt")
+    alone = kind.load(tmp_path / "policy.pt")
+    np.testing.assert_array_equal(alone.predict(observation, deterministic=True)[0], before)
+
+
+def test_the_promised_slopes_hold_in_the_action_that_is_taken():
+    caps = {"slope_min": 0.05, "slope_max": [[2.0, 1.0], [0.2, 0.1]]}
+    kwargs = {"network_kwargs": caps, "R": [1.0, -1.0], "u0": [0.5, 0.0]}
+    model = SB3PPO(ContractingPolicy, PegTouchEnv(), policy_kwargs=kwargs, device="cpu")
+    observation = torch.randn(200, 4, requires_grad=True)
+    mean = model.policy.get_distribution(observation).distribution.mean
+    low, high = model.policy.slope_bounds()
+    assert (low >= 0.05 - 1e-7).all()
+    assert (high <= np.array(caps["slope_max"]) * (1 + 1e-6)).all()
+    slope = torch.stack(
+        [
+            torch.autograd.grad(mean[:, i].sum(), observation, retain_graph=True)[0]
+            for i in range(2)
+        ],
+        1,
+    ).reshape(200, 2, 2, 2)
+    own = torch.einsum("biij->bij", slope) * torch.tensor([-1.0, 1.0])[:, None]
+    torch.testing.assert_close(own, model.policy.jacobian(observation.detach().view(200, 2, 2)))
+    assert (own >= torch.as_tensor(low) - 1e-6).all()
+    assert (own <= torch.as_tensor(high) + 1e-6).all()
+    optimised = {id(p) for group in model.policy.optimizer.param_groups for p in group["params"]}
+    assert optimised == {id(p) for p in model.policy.parameters()}
+
+
+def test_negative_weights_are_refused():
+    model = SB3PPO(ContractingPolicy, PegTouchEnv(), device="cpu")
+    state = model.policy.state_dict()
+    state["action_net.network.mlp.weights.0"] -= 10.0
+    with pytest.raises(NegativeWeightError, match="action_net"):
+        model.policy.load_state_dict(state)
+
+
+def test_batched_environment_reports_what_ended():
+    env = BatchedVecEnv(PegTouchVectorEnv(num_envs=3, horizon=4))
+    env.seed(5)
+    env.reset()
+    total = np.zeros(3)
+    for step in range(4):
+        observation, reward, done, infos = env.step(np.zeros((3, 2)))
+        total += reward
+        assert done.all() == (step == 3)
+    for index, info in enumerate(infos):
+        assert info["episode"]["r"] == pytest.approx(total[index], rel=1e-5)
+        assert info["episode"]["l"] == 4
+        assert info["TimeLimit.truncated"]
+        assert not np.allclose(info["terminal_observation"], observation[index])
+    assert env.get_attr("num_envs", [0, 2]) == [3, 3]
+
+
+def test_spaces_that_do_not_fit():
+    schedule = lambda _: 1e-3  # noqa: E731
+    action, seen = spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (5,))
+    with pytest.raises(ValueError, match=r"shape \(4,\)"):
+        ContractingPolicy(seen, action, schedule)
+    with pytest.raises(ValueError, match="Box of one axis"):
+        ContractingPolicy(seen, spaces.Discrete(3), schedule)
+    policy = ContractingPolicy(seen, action, schedule, layout={"s": slice(1, 5)})
+    assert policy.actor.n == 2
