@@ -217,11 +217,32 @@ def possible_combinations(f_y: ArrayLike, f_u: ArrayLike) -> tuple[Possibility, 
     slow = float(eigenvalues.real.max())
     floor = "" if slow < 0.0 else f"; |d pi/dz| must exceed {slow:.6g} everywhere (slope floor)"
     answers = [
-        _try(names[0], hierarchical, f_y, f_u, "f_y is real-diagonalizable: couplings go one way"),
-        _try(names[1], schur, f_y, f_u, "f_y has real eigenvalues: triangular by a rotation"),
-        _try(names[2], feedback, f_y, f_u, f"f_u is invertible: R = I, couplings rotate{floor}"),
+        _try(
+            names[0],
+            hierarchical,
+            f_y,
+            f_u,
+            "f_y has real eigenvectors, so that couplings go one way",
+        ),
+        _try(
+            names[1],
+            schur,
+            f_y,
+            f_u,
+            "f_y has real eigenvalues, so that a rotation makes it triangular",
+        ),
+        _try(
+            names[2],
+            feedback,
+            f_y,
+            f_u,
+            f"T_a = (T_y f_u)^-1 leaves rotations as the only couplings{floor}",
+        ),
     ]
-    possible, reason = answers[2].possible, "every real part is negative: skew couplings"
+    possible, reason = (
+        answers[2].possible,
+        "every real part is negative, so that all couplings can be made skew",
+    )
     if possible and slow >= 0.0:
         possible, reason = False, f"the real part {slow:.6g} 1/s is not negative"
     answers.append(

@@ -1,0 +1,8 @@
+"""Solution of the exercise of lesson 03."""
+
+import numpy as np
+
+
+def my_B(s, w, p, q):
+    """Gain of the feedback form: skew couplings, negative definite self-feedback."""
+    return np.array([[p[0] * s - q[0], p[1] * w], [-p[0] * w, p[1] * s - q[1]]])
