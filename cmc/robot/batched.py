@@ -113,7 +113,7 @@ class BatchedController:
         """Joint torques (N, 7) that realise tip accelerations (N, 6)."""
         law, jac, velocity = self.law, self.jac, self._qvel
         qn = law.posture_stiffness * (self._posture - self._qpos) - law.posture_damping * velocity
-        r = reference - self._drift()
+        r = reference - self._drift() if law.drift else reference
         disturbed = (jac @ qn[..., None])[..., 0]  # what the posture would do to the tip
         mass = self._mass()
         transposed = jac.swapaxes(1, 2)
@@ -156,13 +156,24 @@ class BatchedController:
         return mass
 
     def _solve(self, matrix: Array, right: Array) -> Array:
-        factor = np.linalg.cholesky(matrix + 1e-12 * np.eye(matrix.shape[-1]))
-        pivot = factor.diagonal(axis1=-2, axis2=-1).min(-1) ** 2
-        if (pivot < self.law.pivot_floor).any():
-            extra = np.maximum(self.law.pivot_floor - pivot, 0.0)
-            matrix = matrix + extra[:, None, None] * np.eye(matrix.shape[-1])
-        solution = np.asarray(np.linalg.solve(matrix, right[..., None]), dtype=np.float64)
-        return solution[..., 0]
+        """Solve with positive matrices (N, d, d) whose pivots are kept from zero."""
+        floor = self.law.pivot_floor
+        try:
+            pivots = np.linalg.cholesky(matrix).diagonal(axis1=-2, axis2=-1) ** 2
+            singular = np.flatnonzero((pivots < floor).any(-1))
+        except np.linalg.LinAlgError:
+            singular = np.arange(len(matrix))
+        regular = matrix
+        if len(singular):
+            regular = matrix.copy()
+            regular[singular] = np.eye(matrix.shape[-1])
+        solution = np.asarray(np.linalg.solve(regular, right[..., None])[..., 0], dtype=np.float64)
+        for k in singular:
+            factor, one = matrix[k].copy(), np.empty(matrix.shape[-1])
+            mujoco.mju_cholFactor(factor, floor)
+            mujoco.mju_cholSolve(one, factor, right[k])
+            solution[k] = one
+        return solution
 
 
 def _dense_index(model: mujoco.MjModel) -> tuple[NDArray[np.intp], NDArray[np.bool_] | None]:

@@ -7,6 +7,7 @@ task scenes include it. `load_scene` fits the peg and compiles.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import mujoco
@@ -82,7 +83,10 @@ class Peg:
 
 
 def load_scene(
-    scene: str | Path = "panda.xml", peg: Peg | None = None, timestep: float = 0.002
+    scene: str | Path = "panda.xml",
+    peg: Peg | None = None,
+    timestep: float = 0.002,
+    history: int = 0,
 ) -> mujoco.MjModel:
     """Compile a scene with the Panda and its peg.
 
@@ -90,6 +94,7 @@ def load_scene(
         scene: name of a shipped scene or path of an MJCF file that includes `panda.xml`.
         peg: the tool; a rigid 50 mm peg by default.
         timestep: physics step, s.
+        history: number of physics steps the contact sensors remember in `data.history`.
 
     Raises:
         SceneError: if the file is missing, does not parse, or holds no peg.
@@ -100,6 +105,8 @@ def load_scene(
     spec = _read(scene)
     _fit(spec, peg or Peg(), scene)
     spec.option.timestep = timestep
+    for sensor in spec.sensors:
+        sensor.nsample = history
     try:
         return spec.compile()
     except ValueError as error:
@@ -176,14 +183,14 @@ def inverse_kinematics(
     quat: ArrayLike = DOWN,
     tool: float = FINGERTIP + 0.05,
     q0: ArrayLike = READY,
-    tolerance: float = 1e-9,
+    tolerance: float = 1e-10,
 ) -> Array:
     """Joint angles that put the tool tip at a pose, by damped least squares from `q0`.
 
     Args:
         position: of the tip, (3,), m.
         quat: orientation (w, x, y, z), (4,).
-        tool: distance from the flange to the tip, m.
+        tool: distance from the flange to the tip along the hand's z axis, m.
         q0: first guess, (7,), rad; it also decides the posture.
         tolerance: on the pose error, m and rad.
 
@@ -196,16 +203,22 @@ def inverse_kinematics(
         raise ValueError(f"wanted (3,) and (4,), got {target.shape} and {orientation.shape}")
     if not (np.isfinite(target).all() and np.linalg.norm(orientation) > 0):
         raise ValueError(f"wanted a finite pose, got {target} and {orientation}")
-    wanted = np.empty(9)
-    mujoco.mju_quat2Mat(wanted, orientation / np.linalg.norm(orientation))
+    orientation = orientation / np.linalg.norm(orientation)
+    model = _bare_arm()
+    data, hand = mujoco.MjData(model), model.body("hand").id
+    jac, error, offset = np.zeros((6, model.nv)), np.zeros(6), np.array([0.0, 0.0, tool])
     q = np.clip(np.asarray(q0, float), LOWER, UPPER)
-    for _ in range(200):
-        error = _pose_error(q, target, wanted.reshape(3, 3), tool)
+    for _ in range(100):
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        tip = data.xpos[hand] + data.xmat[hand].reshape(3, 3) @ offset
+        error[:3] = target - tip
+        error[3:] = _rotation_between(data.xquat[hand], orientation)
         if np.abs(error).max() < tolerance:
             return q
-        jacobian = _numeric_jacobian(q, target, wanted.reshape(3, 3), tool)
-        damped = jacobian @ jacobian.T + 1e-8 * np.eye(6)
-        step = -jacobian.T @ np.linalg.solve(damped, error)
+        mujoco.mj_jac(model, data, jac[:3], jac[3:], tip, hand)
+        step = jac.T @ np.linalg.solve(jac @ jac.T + 1e-9 * np.eye(6), error)
         q = np.clip(q + step * min(1.0, 0.3 / np.abs(step).max()), LOWER, UPPER)
     raise UnreachableError(
         f"no joint angles within the limits put the tip at {np.round(target, 4)} m: "
@@ -213,20 +226,15 @@ def inverse_kinematics(
     )
 
 
-def _pose_error(q: Array, target: Array, wanted: Array, tool: float) -> Array:
-    """Target minus pose: metres, and the rotation vector (log map) in the world frame."""
-    position, rotation = forward_kinematics(q, tool)
-    quat, vector = np.empty(4), np.empty(3)
-    mujoco.mju_mat2Quat(quat, (wanted @ rotation.T).ravel())
-    mujoco.mju_quat2Vel(vector, quat, 1.0)
-    return np.concatenate([target - position, vector])
+@cache
+def _bare_arm() -> mujoco.MjModel:
+    return load_scene()
 
 
-def _numeric_jacobian(q: Array, target: Array, wanted: Array, tool: float) -> Array:
-    """Derivative of the pose error by central differences, (6, 7)."""
-    step = 1e-6
-    moved = [
-        _pose_error(q + s, target, wanted, tool) - _pose_error(q - s, target, wanted, tool)
-        for s in step * np.eye(JOINTS)
-    ]
-    return np.array(moved).T / (2 * step)
+def _rotation_between(start: Array, end: Array) -> Array:
+    """Rotation vector in the world frame that turns `start` into `end`, (3,)."""
+    conjugate, difference, vector = np.empty(4), np.empty(4), np.empty(3)
+    mujoco.mju_negQuat(conjugate, start)
+    mujoco.mju_mulQuat(difference, end, conjugate)
+    mujoco.mju_quat2Vel(vector, difference, 1.0)
+    return vector

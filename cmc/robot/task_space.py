@@ -87,8 +87,9 @@ class ControlLaw:
         posture: joint angles the null space returns to, rad.
         posture_stiffness: 1/s^2.
         posture_damping: 1/s.
-        pivot_floor: J M^-1 J^T (or J J^T) is damped where its smallest Cholesky pivot is below
-            this, so that singular poses give bounded torques; elsewhere the control is exact.
+        pivot_floor: Cholesky pivots of J M^-1 J^T (or J J^T) are kept above this, so that singular
+            poses give bounded torques; elsewhere the control is exact.
+        drift: whether J' q' is compensated; at the speeds of the tasks it is negligible.
     """
 
     form: Form = "force"
@@ -98,6 +99,7 @@ class ControlLaw:
     posture_stiffness: float = 1.0
     posture_damping: float = 2.0
     pivot_floor: float = 1e-3
+    drift: bool = True
 
     def __post_init__(self) -> None:
         if self.form not in ("acceleration", "force"):
@@ -147,36 +149,51 @@ class TaskSpaceController:
         self._jacp, self._jacr = self._full[:3], self._full[3:]
         self._dotp, self._dotr = self._jacdot[:3], self._jacdot[3:]
         self.jac, self._jacdot_arm = self._full[:, :JOINTS], self._jacdot[:, :JOINTS]
-        self._qn, self._mqn = np.zeros(nv), np.zeros(nv)
-        self._quat, self._diff, self._rot = (np.zeros(n) for n in (4, 4, 3))
-        self.position, self.velocity = np.zeros(3), np.zeros(6)
+        self._undriven = self._full[:, JOINTS:] if nv > JOINTS else None
+        self._qn_full, self._mqn_full = np.zeros(nv), np.zeros(nv)
+        self._qn, self._mqn = self._qn_full[:JOINTS], self._mqn_full[:JOINTS]
+        self._inverse, self._scratch = np.zeros((6, 6)), np.zeros(JOINTS)
+        self._block_trans, self._block_rot = np.zeros((3, 3)), np.zeros((3, 3))
+        self._force = np.zeros(6)
+        self._local, self._error = np.zeros(3), np.zeros(6)
+        self._etrans, self._erot = self._error[:3], self._error[3:]
+        self._solution = {3: np.zeros(3), 6: np.zeros(6)}
+        self.position, self.velocity, self.quat = np.zeros(3), np.zeros(6), np.zeros(4)
+        self._data: mujoco.MjData | None = None
+
+    def _bind(self, data: mujoco.MjData) -> None:
+        """Keep views of what is read, which costs more to look up than to read."""
+        self._data = data
+        self._site_pos, self._site_mat = data.site_xpos[self.site], data.site_xmat[self.site]
+        self._qpos, self._qvel = data.qpos[:JOINTS], data.qvel[:JOINTS]
+        self._bias, self._passive = data.qfrc_bias[:JOINTS], data.qfrc_passive[:JOINTS]
 
     def observe(self, data: mujoco.MjData) -> None:
         """Read position, orientation, Jacobian and velocity of the site from the current state."""
+        if data is not self._data:
+            self._bind(data)
         mujoco.mj_jacSite(self.model, data, self._jacp, self._jacr, self.site)
-        self._full[:, JOINTS:] = 0.0  # sliders and the peg's mount are not driven
-        self.position[:] = data.site_xpos[self.site]
-        mujoco.mju_mat2Quat(self._quat, data.site_xmat[self.site])
-        np.matmul(self.jac, data.qvel[:JOINTS], out=self.velocity)
+        if self._undriven is not None:
+            self._undriven.fill(0.0)  # sliders and the peg's mount have no motor
+        self.position[:] = self._site_pos
+        mujoco.mju_mat2Quat(self.quat, self._site_mat)
+        self.jac.dot(self._qvel, out=self.velocity)
 
     def error(self, position: Array, quat: Array) -> Array:
         """Pose error e = (x_d - x, rotation vector from x to x_d in the world frame), (6,).
 
         The rotation is the log map; the translation is shortened to the law's error limit.
         """
-        error = np.empty(6)
-        np.subtract(position, self.position, out=error[:3])
-        self._quat[1:] *= -1.0
-        mujoco.mju_mulQuat(self._diff, quat, self._quat)
-        self._quat[1:] *= -1.0
-        mujoco.mju_quat2Vel(self._rot, self._diff, 1.0)
-        error[3:] = self._rot
+        trans = self._etrans
+        np.subtract(position, self.position, out=trans)
+        mujoco.mju_subQuat(self._local, quat, self.quat)  # log map, in the frame of the site
+        mujoco.mju_rotVecQuat(self._erot, self._local, self.quat)
         limit = self.law.error_limit
         if limit is not None:
-            length = float(error[:3] @ error[:3]) ** 0.5
+            length = float(trans.dot(trans)) ** 0.5
             if length > limit:
-                error[:3] *= limit / length
-        return error
+                trans *= limit / length
+        return self._error.copy()
 
     def torque(self, data: mujoco.MjData, position: Array, quat: Array, u: Array) -> Array:
         """Joint torques (7,), N m, before the motors' limits.
@@ -202,43 +219,39 @@ class TaskSpaceController:
 
         The site must have been observed in this state.
         """
-        law, model, jac, velocity = self.law, self.model, self.jac, data.qvel[:JOINTS]
-        qn = self._qn[:JOINTS]
-        np.subtract(self._posture, data.qpos[:JOINTS], out=qn)
+        law, model, jac, qn = self.law, self.model, self.jac, self._qn
+        np.subtract(self._posture, self._qpos, out=qn)
         qn *= law.posture_stiffness
-        qn -= law.posture_damping * velocity
-        mujoco.mj_jacDot(model, data, self._dotp, self._dotr, self.position, self._body)
-        r = reference - self._jacdot_arm @ velocity
-        disturbed = jac @ qn  # what the posture would do to the tip
+        np.multiply(self._qvel, law.posture_damping, out=self._scratch)
+        qn -= self._scratch
+        disturbed = jac.dot(qn)  # what the posture would do to the tip
+        if law.drift:
+            mujoco.mj_jacDot(model, data, self._dotp, self._dotr, self.position, self._body)
+            reference = reference - self._jacdot_arm.dot(self._qvel)
         if law.form == "acceleration":
-            r -= disturbed
-            qn += jac.T @ self._solve(jac @ jac.T, r)
-            mujoco.mj_mulM(model, data, self._mqn, self._qn)
-            tau = self._mqn[:JOINTS] + data.qfrc_bias[:JOINTS]  # tau_task_space_control
+            qn += self._solve(jac @ jac.T, reference - disturbed).dot(jac)
+            mujoco.mj_mulM(model, data, self._mqn_full, self._qn_full)
+            tau = self._mqn + self._bias  # tau_task_space_control
         else:
-            mujoco.mj_mulM(model, data, self._mqn, self._qn)
+            mujoco.mj_mulM(model, data, self._mqn_full, self._qn_full)
             mujoco.mj_solveM(model, data, self._solved, self._full)
-            inverse = self._solved @ self._full.T  # J M^-1 J^T
-            tau = self._mqn[:JOINTS] + data.qfrc_bias[:JOINTS]
+            inverse = np.matmul(self._solved, self._full.T, out=self._inverse)  # J M^-1 J^T
+            tau = self._mqn + self._bias
             if law.split:
-                tau -= self._solve(inverse.copy(), disturbed) @ jac
-                tau += self._solve(inverse[:3, :3].copy(), r[:3]) @ jac[:3]
-                tau += self._solve(inverse[3:, 3:].copy(), r[3:]) @ jac[3:]
+                trans, rot, force = self._block_trans, self._block_rot, self._force
+                trans[:], rot[:] = inverse[:3, :3], inverse[3:, 3:]
+                undo = self._solve(inverse, disturbed)
+                np.subtract(self._solve(trans, reference[:3]), undo[:3], out=force[:3])
+                np.subtract(self._solve(rot, reference[3:]), undo[3:], out=force[3:])
             else:
-                r -= disturbed
-                tau += self._solve(inverse, r) @ jac  # Nakanishi 3.3
-        tau -= data.qfrc_passive[:JOINTS]  # joint damping is compensated
+                force = self._solve(inverse, reference - disturbed)
+            tau += force.dot(jac)  # Nakanishi 3.3
+        tau -= self._passive  # joint damping is compensated
         return tau
 
     def _solve(self, matrix: Array, right: Array) -> Array:
-        """Solve with a positive matrix, damped near singular poses."""
-        factor = matrix.copy()
-        mujoco.mju_cholFactor(factor, 1e-12)
-        pivot, floor = float(factor.diagonal().min()) ** 2, self.law.pivot_floor
-        if pivot < floor:
-            matrix[np.diag_indices_from(matrix)] += floor - pivot
-            factor = matrix
-            mujoco.mju_cholFactor(factor, 1e-12)
-        solution = np.empty(len(right))
-        mujoco.mju_cholSolve(solution, factor, right)
+        """Solve with a positive matrix whose pivots are kept from zero; overwrites it."""
+        mujoco.mju_cholFactor(matrix, self.law.pivot_floor)
+        solution = self._solution[len(right)]
+        mujoco.mju_cholSolve(solution, matrix, right)
         return solution

@@ -1,0 +1,193 @@
+"""Gymnasium around `PandaTask`: a single environment and a natively batched one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, get_args
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import ArrayLike, NDArray
+
+from cmc.envs.panda_task import Array, Mask, PandaTask, checked
+
+Observation = NDArray[np.float32]
+ActionMode = Literal["two_level", "low", "high"]
+LowLevel = Callable[[Array, Array], ArrayLike]
+"""Low-level policy: y (N, 6) and its integral (N, 6) to u (N, 6)."""
+
+
+class ActionInterface:
+    """How one action array becomes sub-goals and low-level actions.
+
+    - "two_level": (u, sub-goal), concatenated. The sub-goal is read at the first tick and then at
+      every `horizon`-th one; in between it is ignored.
+    - "low": u alone; sub-goals come from `set_subgoal`, and the start pose is the first.
+    - "high": the sub-goal alone; a step lasts `horizon` ticks, with `low_level` (default: u = 0)
+      acting at every tick. Rewards are summed, contact forces and penetrations maximised.
+    """
+
+    def __init__(self, task: PandaTask, mode: ActionMode, low_level: LowLevel | None) -> None:
+        if mode not in get_args(ActionMode):
+            raise ValueError(f"action_mode must be one of {get_args(ActionMode)}, got {mode!r}")
+        if low_level is not None and (mode != "high" or task.config.command == "joint"):
+            raise ValueError('low_level goes with action_mode "high" and a pose command only')
+        self.task, self.mode, self._low_level = task, mode, low_level
+        c = task.config
+        high = np.array([c.subgoal_low, c.subgoal_high])
+        low = np.array([np.negative(c.u_limit), c.u_limit])
+        both = {"two_level": np.hstack([low, high]), "low": low, "high": high}[mode]
+        self.space: Any = spaces.Box(*both.astype(np.float32))
+        self._split = c.low_size
+        self._shape = (task.num, both.shape[1])
+
+    def step(self, action: ArrayLike) -> tuple[Array, Array, Mask, Mask, dict[str, Any]]:
+        """One environment step; as `PandaTask.step`."""
+        task = self.task
+        if self.mode == "low":
+            return task.step(action)
+        values = checked(action, self._shape, "action")
+        if self.mode == "two_level":
+            due = task.due
+            if due.any():
+                task.set_subgoal(values[:, self._split :], due)
+            return task.step(values[:, : self._split])
+        return self._macro_step(values)
+
+    def _macro_step(self, subgoal: Array) -> tuple[Array, Array, Mask, Mask, dict[str, Any]]:
+        task = self.task
+        obs, ticks = task.set_subgoal(subgoal), []
+        for _ in range(task.config.horizon):
+            u: ArrayLike = np.zeros((task.num, task.config.low_size))
+            if self._low_level is not None:
+                fields = (obs[:, task.layout[name]] for name in ("latent", "integral"))
+                u = self._low_level(*fields)
+            obs, reward, terminated, truncated, info = task.step(u)
+            ticks.append((reward, info))
+            if truncated.any():
+                break
+        for group in ("reward_terms", "tracking_terms"):
+            info[group] = {
+                name: sum((i[group][name] for _, i in ticks), np.zeros(task.num))
+                for name in info[group]
+            }
+        for name in ("contact_force_max", "penetration"):
+            info[name] = np.max([i[name] for _, i in ticks], axis=0)
+        total = np.sum([reward for reward, _ in ticks], axis=0)
+        return obs, total, terminated, truncated, info
+
+
+class PandaEnv(gym.Env[Observation, NDArray[np.float32]]):
+    """One world of a peg task; the tasks' own classes document spaces and rewards."""
+
+    metadata: dict[str, Any] = {"render_modes": []}
+
+    def __init__(
+        self,
+        task: PandaTask,
+        action_mode: ActionMode = "two_level",
+        low_level: LowLevel | None = None,
+    ) -> None:
+        self.task = task
+        self._interface = ActionInterface(task, action_mode, low_level)
+        self.action_space = self._interface.space
+        self.observation_space = observation_space(task)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start a new episode."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self.task.seed(seed)
+        return self.task.reset()[0].astype(np.float32), {}
+
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One step; see the class for the action."""
+        obs, reward, _, truncated, info = self._interface.step(np.asarray(action)[None])
+        flat = {
+            name: {term: float(value[0]) for term, value in entry.items()}
+            if isinstance(entry, dict)
+            else entry[0].item()
+            for name, entry in info.items()
+        }
+        return obs[0].astype(np.float32), float(reward[0]), False, bool(truncated[0]), flat
+
+    def set_subgoal(self, high_action: ArrayLike) -> Observation:
+        """Set the sub-goal and observe again; for the action mode "low"."""
+        return self.task.set_subgoal(np.asarray(high_action)[None])[0].astype(np.float32)
+
+    def snapshot(self) -> dict[str, Any]:
+        """Everything that decides what follows."""
+        return self.task.snapshot()
+
+    def restore(self, snapshot: dict[str, Any]) -> Observation:
+        """Go back to a snapshot; the observation there."""
+        return self.task.restore(snapshot)[0].astype(np.float32)
+
+
+class PandaVectorEnv(VectorEnv[Observation, ArrayLike, Any]):
+    """N worlds stepped in one call; world k with seed s + k is the single environment with it."""
+
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self,
+        task: PandaTask,
+        action_mode: ActionMode = "two_level",
+        low_level: LowLevel | None = None,
+        autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
+    ) -> None:
+        if autoreset_mode not in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
+            raise ValueError(f"autoreset_mode: wanted SAME_STEP or DISABLED, got {autoreset_mode}")
+        self.task, self.num_envs = task, task.num
+        self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
+        self._same_step = autoreset_mode is AutoresetMode.SAME_STEP
+        self._interface = ActionInterface(task, action_mode, low_level)
+        self.single_action_space = self._interface.space
+        self.single_observation_space = observation_space(task)
+        self.action_space = batch_space(self.single_action_space, task.num)
+        self.observation_space = batch_space(self.single_observation_space, task.num)
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start new episodes everywhere, or where `options["reset_mask"]` says so."""
+        if seed is not None:
+            self.task.seed(seed)
+        mask = (options or {}).get("reset_mask")
+        return self.task.reset(mask).astype(np.float32), {}
+
+    def step(self, actions: ArrayLike) -> tuple[Observation, Array, Mask, Mask, dict[str, Any]]:
+        """One step of every world; with SAME_STEP, ended episodes start anew at once."""
+        obs, reward, terminated, truncated, info = self._interface.step(actions)
+        if self._same_step and truncated.any():
+            last = np.empty(self.num_envs, dtype=object)
+            last[truncated] = list(obs[truncated].astype(np.float32))
+            info = {**info, "final_obs": last, "_final_obs": truncated}
+            info |= {"final_info": {"success": info["success"]}, "_final_info": truncated}
+            obs = self.task.reset(truncated)
+        return obs.astype(np.float32), reward, terminated, truncated, info
+
+    def set_subgoal(self, high_action: ArrayLike, mask: Mask | None = None) -> Observation:
+        """Set the sub-goals of the masked worlds and observe again; for the action mode "low"."""
+        return self.task.set_subgoal(high_action, mask).astype(np.float32)
+
+    def snapshot(self) -> dict[str, Any]:
+        """Everything that decides what follows."""
+        return self.task.snapshot()
+
+    def restore(self, snapshot: dict[str, Any]) -> Observation:
+        """Go back to a snapshot; the observations there."""
+        return self.task.restore(snapshot).astype(np.float32)
+
+
+def observation_space(task: PandaTask) -> spaces.Box:
+    """Unbounded box of the task's observation size: nothing in it is clipped."""
+    return spaces.Box(-np.inf, np.inf, (task.observation_size,), dtype=np.float32)
