@@ -91,8 +91,7 @@ class TwoLinkArm:
     def acceleration(self, q: ArrayLike, dq: ArrayLike, tau: ArrayLike) -> Array:
         """Joint acceleration q'' under torques, (..., 2), rad/s^2."""
         rest = np.asarray(tau, dtype=float) - self.bias(q, dq)
-        ddq: Array = np.linalg.solve(self.inertia(q), rest[..., None])[..., 0]
-        return ddq
+        return np.asarray(np.linalg.solve(self.inertia(q), rest[..., None])[..., 0], dtype=float)
 
     def task_torque(self, q: ArrayLike, dq: ArrayLike, p: ArrayLike) -> Array:
         """Torque that gives the tip the acceleration p: H J^-1 (p - J' q') + C q' + g, (..., 2).
