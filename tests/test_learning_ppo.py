@@ -18,18 +18,18 @@ from gymnasium.vector import AutoresetMode
 from cmc import store
 from cmc.envs.peg_touch import PegTouchVectorEnv
 from cmc.learning import training_state
-from cmc.learning.ppo import (
-    PPO,
-    PPOConfig,
-    clip_gradients,
-    generalised_advantage,
-    normalised,
-    shuffle,
-    surrogate_gradient,
-)
+from cmc.learning.ppo import PPO, PPOConfig
 from cmc.learning.progress import bar
 from cmc.learning.rollout import Rollout, collect
-from cmc.policies import IndependentNetwork, JointNetwork, ModularPolicy, PositiveNetwork
+from cmc.learning.seed_axis import clip_gradients, shuffle
+from cmc.learning.surrogate import generalised_advantage, normalised, surrogate_gradient
+from cmc.policies import (
+    DirectPolicy,
+    IndependentNetwork,
+    JointNetwork,
+    ModularPolicy,
+    PositiveNetwork,
+)
 
 SMALL = PPOConfig(steps=10, epochs=2, minibatches=2, critic_hidden=(8,))
 RECORD = {"study": "test", "method": "cppo"}
@@ -277,3 +277,7 @@ def test_bad_seeds():
         PPO(env, policy, [])
     with pytest.raises(ValueError, match="divides 5"):
         PPO(env, policy, [0, 1])
+    with pytest.raises(ValueError, match="2 seeds"):
+        PPO(env, policy, [0])
+    with pytest.raises(ValueError, match="outputs"):
+        PPO(env, DirectPolicy(JointNetwork(3, inputs=4), part=slice(0, 4)), [0])

@@ -274,6 +274,9 @@ def test_the_numpy_function_equals_the_module(make, seeds):
     observation = signals(*([len(seeds)] if seeds else []), 7, 4)
     expected = policy(observation).detach().numpy()
     np.testing.assert_allclose(as_numpy(policy)(observation.numpy()), expected, rtol=1e-12)
+    if seeds:
+        with pytest.raises(ValueError, match="seeds"):
+            as_numpy(policy)(np.zeros((3, 2, 4)))
 
 
 def test_state_dict_round_trip_and_refusal():

@@ -14,8 +14,7 @@ training that is killed and resumed ends with the weights of one that was not.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,8 @@ from torch import Tensor, nn
 
 from cmc.learning import training_state
 from cmc.learning.rollout import Rollout, collect
+from cmc.learning.seed_axis import clip_gradients, shuffle, single_thread
+from cmc.learning.surrogate import generalised_advantage, normalised, surrogate_gradient
 from cmc.policies import StackedMLP
 
 Callback = Callable[[dict[str, Any]], object]
@@ -86,7 +87,8 @@ class PPO:
         config: hyperparameters.
 
     Raises:
-        ValueError: if there is no seed or the trajectories cannot be shared out equally.
+        ValueError: if there is no seed, the trajectories cannot be shared out equally, or the
+            policy has other seeds or sizes.
     """
 
     def __init__(
@@ -107,6 +109,11 @@ class PPO:
         inputs = info.get("privileged", first).shape[-1]
         self.critic = StackedMLP(inputs, 1, self.config.critic_hidden, seeds=self.seeds, last=0.1)
         n = env.single_action_space.shape[0]  # type: ignore[index]
+        lead = (len(self.seeds), env.num_envs // len(self.seeds))
+        with torch.no_grad():
+            found = policy(torch.as_tensor(first).reshape(*lead, -1)).shape
+        if tuple(found) != (*lead, n):
+            raise ValueError(f"wanted a policy with outputs {(*lead, n)}; got {tuple(found)}")
         self.log_std = nn.Parameter(torch.full((len(self.seeds), 1, n), self.config.log_std_start))
         named = [*policy.named_parameters("policy"), *self.critic.named_parameters("critic")]
         self.parameters = {**dict(named), "log_std": self.log_std}
@@ -260,97 +267,3 @@ class PPO:
         with torch.no_grad():
             self.log_std.clamp_(min=c.log_std_floor)
         return {"ratio": ratio, "value_error": error[..., 0]}
-
-
-@contextmanager
-def single_thread() -> Iterator[None]:
-    """Keep torch to one thread: on products this small more threads only wait for each other."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-def normalised(advantage: Tensor) -> Tensor:
-    """Shift and scale each row of advantages (S, m) to mean 0 and standard deviation 1."""
-    spread, centre = torch.std_mean(advantage, dim=1, keepdim=True)
-    return (advantage - centre) / (spread + 1e-8)
-
-
-def surrogate_gradient(
-    mean: Tensor,
-    log_std: Tensor,
-    action: Tensor,
-    old_log_probability: Tensor,
-    advantage: Tensor,
-    clip: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradient of the clipped surrogate for a Gaussian policy, by mean and log_std.
-
-    With r = p(action)/p_old(action) the loss L = -mean_m min(r A, clip(r, 1 - c, 1 + c) A) has
-
-        dL/dlog p = -r A / m   where r A is the smaller of the two, and 0 where it is clipped,
-        dlog p/dmean = x / std,   dlog p/dlog_std = x^2 - 1   with x = (action - mean) / std.
-
-    Args:
-        mean: (S, m, n).
-        log_std: (S, 1, n).
-        action: (S, m, n).
-        old_log_probability: (S, m), without the constant -n/2 log 2 pi.
-        advantage: A, (S, m).
-        clip: c.
-
-    Returns:
-        dL/dmean (S, m, n), dL/dlog_std (S, 1, n) and the ratio r (S, m).
-    """
-    precision = torch.exp(-log_std)
-    x = (action - mean) * precision
-    square = x * x
-    log_probability = -(0.5 * square + log_std).sum(-1)
-    ratio = torch.exp(log_probability - old_log_probability)
-    gain = ratio * advantage
-    active = gain <= ratio.clamp(1.0 - clip, 1.0 + clip) * advantage
-    slope = (gain * active).mul_(-1.0 / advantage.shape[1]).unsqueeze(-1)
-    return slope * (x * precision), (slope * (square - 1.0)).sum(1, keepdim=True), ratio
-
-
-def generalised_advantage(
-    rollout: Rollout, value: np.ndarray, following: np.ndarray, gamma: float, lam: float
-) -> np.ndarray:
-    """Generalised advantage estimate A_t = delta_t + gamma lambda A_t+1 (Schulman et al. 2016).
-
-    delta_t = r_t + gamma V(next) - V(now), where V(next) is the critic at the state that was
-    reached, also where a time limit cut the episode, and 0 only where the task ended.
-
-    Args:
-        rollout: reward, terminated and done, (S, T, E) each.
-        value: critic at the states, (S, T, E).
-        following: critic at the states reached, before any restart, (S, T, E).
-        gamma: discount factor.
-        lam: lambda.
-    """
-    delta = rollout.reward + gamma * following * ~rollout.terminated - value
-    carry = gamma * lam * ~rollout.done
-    advantage = delta.copy()
-    for t in range(delta.shape[1] - 2, -1, -1):
-        advantage[:, t] += carry[:, t] * advantage[:, t + 1]
-    return advantage
-
-
-def shuffle(data: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
-    """Put the rows of data (S, N, columns) in random order, each seed by its own generator."""
-    S, N, columns = data.shape
-    order = np.stack([g.permutation(N) + N * s for s, g in enumerate(generators)])
-    index = torch.from_numpy(order.reshape(-1))
-    return data.reshape(S * N, columns).index_select(0, index).reshape(S, N, columns)
-
-
-def clip_gradients(gradients: Sequence[Tensor | None], seeds: int, max_norm: float) -> None:
-    """Scale each seed's gradient, over all parameters, to a norm of at most `max_norm`."""
-    rows = [gradient.view(seeds, -1) for gradient in gradients if gradient is not None]
-    squares = torch.stack([torch.linalg.vector_norm(row, dim=1) for row in rows])
-    scale = (max_norm / (torch.linalg.vector_norm(squares, dim=0) + 1e-6)).clamp(max=1.0)
-    for row in rows:
-        row.mul_(scale.unsqueeze(1))

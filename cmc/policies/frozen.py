@@ -82,6 +82,7 @@ def _joint(network: JointNetwork) -> Function:
     stack, inputs, outputs = network.mlp.stack, network.inputs, network.n
 
     def run(x: Real) -> Real:
+        _check_seeds(x, network.seeds)
         return evaluate(x.reshape(stack, -1, inputs)).reshape(*x.shape[:-1], outputs)
 
     return run
@@ -96,11 +97,17 @@ def _independent(network: PositiveNetwork | IndependentNetwork) -> Function:
     n, seeds = network.n, network.seeds or 1
 
     def run(s: Real) -> Real:
+        _check_seeds(s, network.seeds)
         x = s.reshape(seeds, -1, n, 2).swapaxes(1, 2).reshape(seeds * n, -1, 2)
         pi = evaluate(x).reshape(seeds, n, -1).swapaxes(1, 2).reshape(s.shape[:-1])
         return pi if slope is None else pi + (slope * s).sum(-1)
 
     return run
+
+
+def _check_seeds(x: Real, seeds: int | None) -> None:
+    if seeds is not None and x.shape[0] != seeds:
+        raise ValueError(f"wanted a leading axis of {seeds} seeds; got shape {x.shape}")
 
 
 def _layers(mlp: StackedMLP, weights: Sequence[Tensor]) -> Function:

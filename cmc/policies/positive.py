@@ -119,11 +119,7 @@ class PositiveNetwork(nn.Module):
 
     def jacobian(self, s: Tensor) -> Tensor:
         """Slopes d pi_i / d s_ij in closed form (`product`): s (..., n, 2) to (..., n, 2)."""
-        weights = self.positive_weights()
-        hidden = self.mlp.hidden_values(to_stack(s, self.seeds, self.n), weights)[:-1]
-        slope = weights[-1].transpose(1, 2)
-        for value, weight in zip(hidden[::-1], weights[-2::-1], strict=True):
-            slope = ((1.0 - value * value) * slope) @ weight.transpose(1, 2)  # M_j W_j of `product`
+        slope = self.mlp.slopes(to_stack(s, self.seeds, self.n), self.positive_weights())
         return from_stack(slope, s, self.seeds) + self.slope_min
 
     def slope_bounds(self) -> tuple[Array, Array]:

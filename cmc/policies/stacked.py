@@ -102,6 +102,14 @@ class StackedMLP(nn.Module):
         """Values after every layer, the output last; x (stack, batch, inputs)."""
         return _layers(x, weights, list(self.biases))
 
+    def slopes(self, x: Tensor, weights: Sequence[Tensor]) -> Tensor:
+        """Derivatives of the first output by the inputs, in closed form: (stack, batch, inputs)."""
+        slope = weights[-1][..., :1].transpose(1, 2)
+        hidden = self.hidden_values(x, weights)[:-1]
+        for value, weight in zip(hidden[::-1], weights[-2::-1], strict=True):
+            slope = ((1.0 - value * value) * slope) @ weight.transpose(1, 2)  # M_j W_j of `product`
+        return slope
+
 
 def _layers(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> list[Tensor]:
     """Values after every layer, by ordinary differentiable operations."""

@@ -42,11 +42,7 @@ class IndependentNetwork(nn.Module):
 
     def jacobian(self, s: Tensor) -> Tensor:
         """Slopes d pi_i / d s_ij in closed form (`product`): s (..., n, 2) to (..., n, 2)."""
-        weights = list(self.mlp.weights)
-        hidden = self.mlp.hidden_values(to_stack(s, self.seeds, self.n), weights)[:-1]
-        slope = weights[-1].transpose(1, 2)
-        for value, weight in zip(hidden[::-1], weights[-2::-1], strict=True):
-            slope = ((1.0 - value * value) * slope) @ weight.transpose(1, 2)
+        slope = self.mlp.slopes(to_stack(s, self.seeds, self.n), list(self.mlp.weights))
         return from_stack(slope, s, self.seeds)
 
 
