@@ -115,7 +115,7 @@ def late_response(delay: float, log_slope: float, tanh: bool) -> dict[str, Any]:
     return {
         "t": 1e3 * LOOP.period * np.arange(steps),
         "e": np.clip(error, -10.0, 10.0),
-        "poles": poles,
+        "poles": poles.astype(complex),
         "circle": np.stack([np.cos(_TURN), np.sin(_TURN)], axis=-1)[:, None],
         "text": f"slope {slope:.2f}: {verdict} (edge {edge:.2f}, guarantee {safe:.2f})",
     }

@@ -157,7 +157,7 @@ def mismatch(tau: float, stiffness: float) -> dict[str, Any]:
     return {
         "t": h * np.arange(60),
         "e": np.clip(path, -50.0, 50.0),
-        "nominal": np.linalg.eigvals(nominal),
-        "real": np.linalg.eigvals(real),
+        "nominal": np.linalg.eigvals(nominal).astype(complex),
+        "real": np.linalg.eigvals(real).astype(complex),
         "text": f"in the nominal metric: {verdict} ({rate:.1f} 1/s); sampled at 10 ms: {held}",
     }
