@@ -178,7 +178,7 @@ def test_evaluation_keeps_what_is_done_and_is_json(run, tmp_path):
     json.dumps(first, allow_nan=False)
     done, total, _ = seen[-1]
     assert done == total == sum(len(m["tests"]) for m in first["methods"].values())
-    again = peg_touch.evaluate(["cppo_bounded", "pi"], **options)
+    again = peg_touch.evaluate(["cppo_bounded"], **options)
     assert again["methods"] == first["methods"]
     certificates = first["methods"]["cppo_bounded"]["certificates"]
     assert [c["episode"] for c in certificates] == [32, 64]
