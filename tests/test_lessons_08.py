@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from cmc.lessons import lesson_08
-from cmc.studies.detectors import judge
 
 
 @pytest.mark.parametrize("stiffness", [5.0, 15.0, 31.0, 62.0])
