@@ -19,7 +19,7 @@ from cmc.theory.certify import certify
 from cmc.theory.combinations import feedback
 from cmc.theory.contraction import contraction_rate, rate_from_cloud
 from cmc.theory.exact import Region, closed_loop, total_jacobian
-from cmc.theory.metric_search import search_metric
+from cmc.theory.metric_search import condition_metric, search_metric
 from cmc.theory.simulate import rk4
 
 
@@ -142,6 +142,27 @@ def test_common_metric_is_a_metric_for_the_whole_hull():
         assert contraction_rate(inside, answer.metric).min() >= answer.rate - 1e-9 > -1e-9
         assert answer.overshoot >= 1
     assert found > 5
+
+
+def test_the_metric_is_the_best_conditioned_one():
+    """Against a grid over [[1, b], [b, d]] for slopes k in [1, 2] and c = 1."""
+    corners = np.array([[[-1.0, -k], [1.0, 0.0]] for k in (1.0, 2.0)])
+    b, d = np.meshgrid(np.linspace(0, 1, 400)[1:-1], np.linspace(0.05, 6, 1200))
+    ok = d > b**2
+    for k in (1.0, 2.0):
+        ok &= 4 * (1 - b) * b * k > (d - b - k) ** 2
+    b, d = b[ok], d[ok]
+    root = np.sqrt((1 + d) ** 2 / 4 - (d - b**2))
+    best = (((1 + d) / 2 + root) / ((1 + d) / 2 - root)).min()
+    found = condition_metric(corners, search_metric(corners).metric)
+    assert contraction_rate(corners, found).min() > 0
+    assert np.linalg.cond(found) == pytest.approx(best, rel=0.02)
+    with pytest.raises(ValueError, match="not a common metric"):
+        condition_metric(corners, np.diag([1.0, 100.0]))
+
+
+def test_the_whole_loop_gets_a_well_conditioned_metric():
+    assert 1 <= certify(policy(), plants.get("coupled_lags")).overshoot < 20
 
 
 def test_single_vertex_reaches_most_of_its_decay():

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
 from cmc.theory.contraction import contraction_factor, contraction_rate, metric_factor, overshoot
-from cmc.theory.metric_search import MetricSearch, search_metric
+from cmc.theory.metric_search import MetricSearch, condition_metric, search_metric
 
 Array = NDArray[np.float64]
 Kind = Literal["frozen", "exact"]
@@ -40,7 +40,8 @@ class Certificate:
             which proves nothing about a loop whose transforms move with its state.
         domain: "continuous", or "sampled" with a zero-order hold.
         rate: Proved contraction rate, 1/s (NaN where nothing is proved).
-        metric: M of the distance that shrinks, (m, m), or None.
+        metric: M of the distance that shrinks, (m, m), or None; in (z, int z), and in (y, int z)
+            where the total Jacobian over a box was used.
         violated: The Jacobian (or step) that stands in the way, (m, m), or None.
         region: Where it holds, in words.
         reason: Why it holds, or does not, in words.
@@ -62,7 +63,7 @@ class Certificate:
 
     @property
     def overshoot(self) -> float:
-        """Bound sqrt(cond(M)) on the Euclidean transient; NaN where nothing is proved."""
+        """Bound sqrt(cond(M)) on the transient in the metric's coordinates; NaN if nothing holds."""
         return float("nan") if self.metric is None else float(overshoot(self.metric))
 
     def __str__(self) -> str:
@@ -195,8 +196,8 @@ def common_metric(
         low, high = (
             (middle, high) if _search(vertices, middle, h).metric is not None else (low, middle)
         )
-    metric = _search(vertices, _SHARE * low, h).metric
-    metric = found.metric if metric is None else metric
+    metric = _search(vertices, (1 + _SHARE) / 2 * low, h).metric
+    metric = found.metric if metric is None else best_conditioned(vertices, metric, _SHARE * low, h)
     return Certificate(
         True,
         kind,
@@ -213,6 +214,13 @@ def rate_in(vertices: ArrayLike, metric: ArrayLike, h: float | None = None) -> f
     if h is None:
         return float(contraction_rate(vertices, metric).min())
     return float(-np.log(contraction_factor(vertices, metric).max()) / h)
+
+
+def best_conditioned(vertices: Array, metric: Array, rate: float, h: float | None = None) -> Array:
+    """The metric of smallest condition number that proves `rate`, from one that does, (m, m)."""
+    if h is not None:
+        return condition_metric(vertices * np.exp(rate * h), metric, discrete=True)
+    return condition_metric(vertices + rate * np.eye(vertices.shape[-1]), metric)
 
 
 def _search(vertices: Array, rate: float, h: float | None) -> MetricSearch:
