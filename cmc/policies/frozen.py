@@ -22,7 +22,7 @@ def as_numpy(policy: nn.Module) -> Function:
     """Return a function from numpy observations to numpy commands, the weights held as they are.
 
     Tanh networks behind `ModularPolicy` and `DirectPolicy` run in numpy, which for the few rows of
-    a control step costs a third of a call into torch; any other policy runs in torch.
+    a control step costs a fifth of a call into torch; any other policy runs in torch.
 
     Args:
         policy: module from observations to commands.
