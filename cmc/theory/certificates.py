@@ -63,7 +63,7 @@ class Certificate:
 
     @property
     def overshoot(self) -> float:
-        """Bound sqrt(cond(M)) on the transient in the metric's coordinates; NaN if nothing holds."""
+        """Bound sqrt(cond(M)) on the transient in the metric's coordinates, or NaN."""
         return float("nan") if self.metric is None else float(overshoot(self.metric))
 
     def __str__(self) -> str:
