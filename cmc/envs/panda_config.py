@@ -27,7 +27,8 @@ class PandaTaskConfig:
         subgoal_low, subgoal_high: bounds of the high-level action, (3,) m, (6,) m and rad,
             or (7,) rad.
         increments: whether sub-goals are increments from the current tip pose, or absolute.
-        workspace_low, workspace_high: box that target positions are clamped to, (3,), m.
+        workspace_low, workspace_high: box that sub-goals are clamped to: positions (3,), m, or
+            joint angles relative to the start (7,), rad.
         tilt_limit: largest rotation of the target from pointing straight down, rad.
         u_limit: bounds of the low-level action, (6,) m/s^2 and rad/s^2, or (7,) N m.
         joint_stiffness: K_p of the joint controller, N m/rad ("joint" only).

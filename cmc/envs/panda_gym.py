@@ -169,7 +169,8 @@ class PandaVectorEnv(VectorEnv[Observation, ArrayLike, Any]):
         obs, reward, terminated, truncated, info = self._interface.step(actions)
         if self._same_step and truncated.any():
             last = np.empty(self.num_envs, dtype=object)
-            last[truncated] = list(obs[truncated].astype(np.float32))
+            for k in np.flatnonzero(truncated):
+                last[k] = obs[k].astype(np.float32)
             info = {**info, "final_obs": last, "_final_obs": truncated}
             info |= {"final_info": {"success": info["success"]}, "_final_info": truncated}
             obs = self.task.reset(truncated)
@@ -188,6 +189,6 @@ class PandaVectorEnv(VectorEnv[Observation, ArrayLike, Any]):
         return self.task.restore(snapshot).astype(np.float32)
 
 
-def observation_space(task: PandaTask) -> spaces.Box:
+def observation_space(task: PandaTask) -> Any:
     """Unbounded box of the task's observation size: nothing in it is clipped."""
     return spaces.Box(-np.inf, np.inf, (task.observation_size,), dtype=np.float32)

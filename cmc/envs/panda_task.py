@@ -71,8 +71,12 @@ class PandaTask:
             np.array(config.subgoal_low),
             np.array(config.subgoal_high),
         )
-        self._space_low = np.array(config.workspace_low)
-        self._space_high = np.array(config.workspace_high)
+        self._space_low, self._space_high = map(
+            np.array, (config.workspace_low, config.workspace_high)
+        )
+        if config.command == "joint":
+            self._space_low = np.maximum(self._q_start + self._space_low, LOWER)
+            self._space_high = np.minimum(self._q_start + self._space_high, UPPER)
         self.target, self._target_quat = np.zeros((num, 3)), np.zeros((num, 4))
         self.target_rotation, self.target_joints = np.zeros((num, 3)), np.zeros((num, JOINTS))
         self._integral, self._goal = np.zeros((num, 6)), np.zeros((num, 3))
@@ -128,7 +132,8 @@ class PandaTask:
             self._goal[k] = self._draw_goal(self.streams[k])
         self.worlds.reset(qpos, mask)
         self._ticks[mask], self._left[mask] = 0, 0.0
-        self._aim(self.worlds.nominal, self.worlds.rotation(), mask)
+        if self.config.command == "pose":
+            self._aim(self.worlds.nominal, self.worlds.rotation(), mask)
         self.target_joints[mask] = self.worlds.qpos[mask, :JOINTS]
         return self._observe(mask)
 
@@ -155,7 +160,8 @@ class PandaTask:
         mask = self._everyone if mask is None else self._checked_mask(mask)
         self._left[mask] = c.horizon * c.tick
         if c.command == "joint":
-            aimed = np.clip(worlds.qpos[:, :JOINTS] + action, LOWER, UPPER)
+            aimed = worlds.qpos[:, :JOINTS] + action
+            aimed = np.minimum(np.maximum(aimed, self._space_low), self._space_high)
             self.target_joints[mask] = aimed[mask]
         elif c.increments:
             self._aim(worlds.nominal + action[:, :3], worlds.rotation() + action[:, 3:], mask)

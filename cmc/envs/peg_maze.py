@@ -45,7 +45,9 @@ JOINT = replace(
     command="joint",
     subgoal_low=(-0.1,) * 7,
     subgoal_high=(0.1,) * 7,
-    u_limit=(1.0,) * 7,
+    workspace_low=(-0.1,) * 7,
+    workspace_high=(0.1,) * 7,
+    u_limit=(0.3,) * 7,
 )
 """Joint increments and joint torques under a hood, for the joint-space baseline (HIRO)."""
 REGIMES = {"stiff": STIFF, "soft": SOFT, "joint": JOINT}
@@ -87,7 +89,7 @@ class PegMazeEnv(PandaEnv):
     6-8 and lasts 20 ticks. Actions outside the bounds are clipped; NaN, infinity and wrong shapes
     raise ValueError. The sub-goal's orientation is straight down.
 
-    Regime "joint": u is 7 joint torques (N m, at most 1), applied as |u| towards the sub-goal, and
+    Regime "joint": u is 7 joint torques (N m, at most 0.3), applied as |u| towards the sub-goal, and
     the sub-goal is 7 joint increments from the current pose (at most 0.1 rad), clamped to the
     joint limits; torque = 1 N m/rad (q_d - q) + u + gravity and Coriolis terms.
 

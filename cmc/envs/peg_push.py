@@ -14,8 +14,8 @@ from cmc.envs.panda_task import Array, Mask, PandaTask
 from cmc.robot.panda import Peg
 from cmc.robot.task_space import PUSH_GAINS, ControlLaw
 
-BOX_TOP = np.array([0.42, 0.0, 0.02])
-"""Centre of the box's top in the world, m; our choice."""
+BOX_TOP = np.array([0.52, 0.0, 0.02])
+"""Centre of the box's top, m; our choice: the arm can tilt by 0.5 rad all around it."""
 TARGET = BOX_TOP + [0.0, 0.0, -0.0125]
 TOUCH_SIDE, TOUCH_DEPTH = 0.0005, 0.0003
 """Strict touch: tip within half the 1 mm target sideways, and 0.3 mm in depth (our choice), m."""
