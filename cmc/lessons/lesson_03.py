@@ -75,7 +75,9 @@ def cascade(strength: float, modules: int = 4) -> dict[str, Any]:
     return {
         "t": t,
         "sizes": np.where(sizes > 0.0, sizes, np.nan),
-        "bars": sizes[:, ::-1, None] / max(float(sizes.max()), 1e-12),
+        "bars": np.round(sizes[:, ::-1, None], 2),
+        "free": sizes[:, -1],
+        "driven": sizes[:, :-1],
         "growth": growth(J, t),
         "text": f"largest on the way {sizes.max():.2f}, at the end {sizes[-1].max():.1e}",
     }

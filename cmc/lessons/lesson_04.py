@@ -100,8 +100,9 @@ def tracking(turns: float, crossing: float) -> dict[str, Any]:
         "anew": z_anew,
         "followed": z_followed,
         "eigenvalues": followed.eigenvalues,
-        "integral_anew": np.cumsum(z_anew, axis=0) * (t[1] - t[0]),
-        "integral_followed": np.cumsum(z_followed, axis=0) * (t[1] - t[0]),
+        **{f"anew_{i + 1}": z_anew[:, i] for i in (0, 1)},
+        **{f"followed_{i + 1}": z_followed[:, i] for i in (0, 1)},
+        **{f"eigenvalue_{i + 1}": followed.eigenvalues[:, i] for i in (0, 1)},
         "jumps": jumps,
         "text": f"sorted anew: {jumps} jumps; tracked: none",
     }
