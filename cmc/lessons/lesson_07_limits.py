@@ -88,7 +88,7 @@ def noise_price(late: float = 0.02, points: int = 25) -> dict[str, Array]:
 @cache
 def limits_map(points: int = 40) -> DelayMap:
     """Delay against log gain, 40 x 40 cells, predicted and measured (0.3 s)."""
-    return delay_map(LOOP, np.linspace(0.0, 0.1, points), np.geomspace(0.3, 12.0, points))
+    return delay_map(LOOP, np.linspace(0.0, 0.1, points), np.geomspace(0.3, 40.0, points))
 
 
 def late_response(delay: float, log_slope: float, tanh: bool) -> dict[str, Any]:
