@@ -142,7 +142,7 @@ def breathing(damping: float, depth: float) -> Picture:
     """
     loop = plants.FloquetLoop(lag=-damping / 2, p=-damping / 2, depth=depth)
     t = np.linspace(0, 12 * loop.period, 481)
-    w = rk4(loop.rhs, [[0.0, 1.0], [1.0, 0.0], [-0.7, -0.7]], t)[..., 1]
+    w = rk4(loop.rhs, [[0.0, 1.0], [1.0, 0.0], [0.5, -0.8]], t)[..., 1]
     k = 1 + depth * np.cos(2 * t)
     multipliers = floquet_multipliers(lambda time: loop.jacobian(time, np.zeros(2)), loop.period)
     proof = circle_criterion(damping, 1 - depth, 1 + depth)
@@ -251,18 +251,19 @@ def turning() -> Picture:
 
     Returns:
         `t` (m,), `y1` (m, 9) from starts close to 0, and `distance` (m, 8) to the middle one in
-        (y, int z), NaN once a trajectory has left |y1| <= 0.35.
+        (y, int z), NaN once a trajectory has left |y1| <= 0.35; `y1` is NaN beyond 0.5.
     """
     policy, plant = TurningInterface(), plants.Lags(tau=(1.0, 1.0), gain=(1.0, 1.0))
     field = closed_loop(policy, plant, policy.spaces)
     starts = np.zeros((9, 4))
     starts[:, 0] = 0.002 * np.arange(-4, 5)
-    t = np.linspace(0, 0.5, 101)
+    t = np.linspace(0, 0.4, 101)
     paths = rk4(lambda _, s: field(s), starts, t)
     others = np.delete(paths, 4, axis=1)
     distance = np.linalg.norm(others - paths[:, 4:5], axis=-1)
     distance[np.abs(others[..., 0]) > 0.35] = np.nan
-    return {"t": t, "y1": paths[..., 0], "distance": distance}
+    y1 = np.where(np.abs(paths[..., 0]) > 0.5, np.nan, paths[..., 0])
+    return {"t": t, "y1": y1, "distance": distance}
 
 
 def sampled_lag(period: float, slope: float, ratio: float) -> Picture:
