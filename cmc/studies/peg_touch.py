@@ -21,6 +21,7 @@ shape. What it leaves open is chosen here, and everything that differs from it i
 
 from __future__ import annotations
 
+from cmc.envs.peg_touch_config import PegShift, PegTouchConfig
 from cmc.studies.peg_touch_certificates import certificate_of
 from cmc.studies.peg_touch_claims import at, claims, select
 from cmc.studies.peg_touch_evaluation import SHIFTS, TestConfig, run_test, shifted
@@ -43,6 +44,8 @@ __all__ = [
     "METHODS",
     "NAME",
     "SHIFTS",
+    "PegShift",
+    "PegTouchConfig",
     "PegTouchStudy",
     "TestConfig",
     "at",

@@ -48,7 +48,7 @@ class TestConfig:
     """Random stream of the tests; never used in training. Our choice."""
     detectors: DetectorConfig = field(default_factory=DetectorConfig)
     """Definitions of oscillation, drift and offset. Our choice."""
-    sign_every: int = 10
+    sign_every: int = 25
     """Steps between two samples of the slopes on visited states. Our choice."""
 
 
