@@ -86,14 +86,14 @@ def literal(every_step: bool, seconds: float = 0.8) -> dict[str, Array]:
             if k == 0:
                 error.append(e)
             mujoco.mj_step(model, data)
-    return {"t": TICK * np.arange(len(error)), "e": np.array(error)}
+    return {"t": TICK * np.arange(len(error), dtype=float), "e": np.array(error)}
 
 
 def step(setup: Setup = FREE, length: float = 0.01, seconds: float = 0.8) -> dict[str, Array]:
     """A step of the target along x, with the motion that the latent model predicts.
 
     The prediction knows the gains and the recorded u, and nothing of the arm: `e_model` and
-    `y_model` (T, 3) from lambda_d e'' + K_d e' + K_p e + u = 0, u held over each tick.
+    `y_model` (T, 3) from e'' + K_d e' + K_p e + u = 0, held over each tick.
     """
     goal = np.array(setup.start) + [length, 0.0, 0.0]
     out = run(setup, lambda t: goal, seconds)
@@ -101,17 +101,19 @@ def step(setup: Setup = FREE, length: float = 0.01, seconds: float = 0.8) -> dic
 
 
 def predict(gains: Gains, e0: Array, u: Array) -> dict[str, Array]:
-    """Errors (T, 3) and latent signals of the model made of gains, from rest at e0, under u."""
-    latent, n = gains.latent, 200  # explicit Euler at a hundredth of a millisecond per tick part
-    K_p, K_d, h = gains.kp[:3], gains.kd[:3], TICK / n
+    """Errors (T, 3) and latent signals of the model made of gains, from rest at e0, under u.
+
+    The acceleration K_p e + K_d e' + u is held over each tick, as on the robot: exact sampling of
+    a double integrator.
+    """
+    latent, K_p, K_d = gains.latent, gains.kp[:3], gains.kd[:3]
     e, v = e0[:3].copy(), np.zeros(3)
     errors, signals = [], []
     for row in u[:, :3]:
-        errors.append(e.copy())
+        errors.append(e)
         signals.append(latent.K1[:3] * e + latent.K2[:3] * v)
-        for _ in range(n):
-            v = v - h * (K_p * e + K_d * v + row)  # 2nd_sys
-            e = e + h * v
+        held = -(K_p * e + K_d * v + row)  # 2nd_sys
+        e, v = e + TICK * v + TICK**2 / 2 * held, v + TICK * held
     return {"e_model": np.array(errors), "y_model": np.array(signals)}
 
 

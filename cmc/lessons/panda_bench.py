@@ -40,21 +40,21 @@ class Setup:
     """What one run of the bench fixes.
 
     Attributes:
-        gains: of the task-space controller.
-        law: its form and options.
-        policy: from y (6,) to u (6,).
-        peg: the tool.
         scene: the shipped scene.
         start: first tip position, m.
+        policy: from y (6,) to u (6,).
+        gains: of the task-space controller.
+        law: its form and options.
+        peg: the tool.
         every_step: new torque at every physics step in place of the 50 Hz hold.
     """
 
-    gains: Gains = MAZE_GAINS
-    law: ControlLaw = field(default_factory=ControlLaw)
-    policy: Policy = no_policy
-    peg: Peg = field(default_factory=Peg)
     scene: str = "peg_maze.xml"
     start: tuple[float, float, float] = START
+    policy: Policy = no_policy
+    gains: Gains = MAZE_GAINS
+    law: ControlLaw = field(default_factory=ControlLaw)
+    peg: Peg = field(default_factory=Peg)
     every_step: bool = False
 
 
@@ -83,7 +83,8 @@ def run(
 
     Returns:
         Arrays with one row per tick: `t`, `qpos`, `tip` (T, 3), `goal` (T, 3), `e`, `y`, `u`
-        (T, 6), `velocity` (T, 6), `tau` (T, 7), `force` (T, 3) at the tick, and `peak` (T,), the
+        (T, 6), `velocity` (T, 6), `tau` (T, 7), `force` (T, 3) of the walls
+        on the peg at the tick, and `peak` (T,), the
         largest force over the physics steps that follow.
     """
     model, data = world(setup)
@@ -102,7 +103,11 @@ def run(
         if push is not None:
             tau = tau + np.asarray(push(float(data.time)), dtype=float)
         row: list = [data.time, data.qpos.copy(), data.site_xpos[tip].copy(), goal, e, y, u]
-        row += [controller.velocity.copy(), tau, sensor.copy()]
+        row += [
+            controller.velocity.copy(),
+            tau,
+            -sensor,
+        ]  # the sensor reports the peg's push on the walls
         peak = 0.0
         for k in range(SUBSTEPS):
             if setup.every_step and k:
