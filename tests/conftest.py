@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import os
 
-import pytest
-from find_browser import MISSING, find_browser
+# One thread a process: numpy and torch read this when they are imported, and small matrices lose by
+# more of them, badly so when the tests run side by side.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import pytest  # noqa: E402
+from find_browser import MISSING, find_browser  # noqa: E402
 
 
 @pytest.fixture(scope="session")
