@@ -163,13 +163,17 @@ def decompose(f_y: ArrayLike, f_u: ArrayLike) -> AuxiliarySpace:
 def assemble(eigenvalues: Array, V: Array, f_u: Array) -> AuxiliarySpace:
     """Build the space from an eigenbasis: eigenvalues (..., n), `V` and `f_u` (..., n, n)."""
     shape, n = V.shape, V.shape[-1]
+    if n != 2 or V.ndim == 2:
+        T_y = inverse(V)
+        T_a, R = triangularize(T_y @ f_u)
+        return _trusted(T_y, T_a, eigenvalues[..., None] * np.eye(n), R)
     eigenvalues, V, f_u = eigenvalues.reshape(-1, n), V.reshape(-1, n, n), f_u.reshape(-1, n, n)
     arrays = np.empty((4, len(V), n, n))
     for start in range(0, len(V), CHUNK):
         part = slice(start, start + CHUNK)
         T_y, T_a, Lambda, R = arrays[:, part]
         T_y[:] = inverse(V[part])
-        T_a[:], R[:] = triangularize(_product(T_y, f_u[part]))
+        T_a[:], R[:] = triangularize(_planar_product(T_y, f_u[part]))
         Lambda[:] = 0.0
         np.einsum("kii->ki", Lambda)[:] = eigenvalues[part]
     return _trusted(*arrays.reshape(4, *shape))
@@ -207,10 +211,9 @@ def _triangularize_planar(W: Array) -> tuple[Array, Array]:
     return T_a, R
 
 
-def _product(T_y: Array, f_u: Array) -> Array:
-    if T_y.shape[-1] != 2:
-        return T_y @ f_u
-    W = np.empty(T_y.shape)  # many 2x2 products: faster written out than through matmul
+def _planar_product(T_y: Array, f_u: Array) -> Array:
+    """Many 2x2 products: faster written out than through matmul."""
+    W = np.empty(T_y.shape)
     for i in range(2):
         for j in range(2):
             W[..., i, j] = T_y[..., i, 0] * f_u[..., 0, j] + T_y[..., i, 1] * f_u[..., 1, j]

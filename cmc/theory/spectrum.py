@@ -180,10 +180,11 @@ def _lapack(f_y: Array) -> tuple[Array, Array]:
     eigenvalues, V = np.linalg.eig(f_y)
     if np.iscomplexobj(eigenvalues):
         eigenvalues, V = _drop_rounding(f_y, eigenvalues, V)
-    order = np.argsort(-eigenvalues, axis=-1, kind="stable")
-    eigenvalues = np.take_along_axis(eigenvalues, order, axis=-1)
-    V = np.take_along_axis(V, order[..., None, :], axis=-1)
-    defective = ~(np.linalg.cond(V) <= MAX_CONDITION)
+    if (eigenvalues[..., 1:] > eigenvalues[..., :-1]).any():
+        order = np.argsort(-eigenvalues, axis=-1, kind="stable")
+        eigenvalues = np.take_along_axis(eigenvalues, order, axis=-1)
+        V = np.take_along_axis(V, order[..., None, :], axis=-1)
+    defective = _ill_conditioned(V)
     if defective.any():
         raise_defective(_where(defective))
     return eigenvalues, V
@@ -194,7 +195,7 @@ def _drop_rounding(f_y: Array, eigenvalues: Array, V: Array) -> tuple[Array, Arr
     size = np.linalg.norm(f_y, axis=(-2, -1))
     pairs = np.abs(eigenvalues.imag).max(axis=-1) > 1e-12 * size
     if pairs.any():
-        defective = pairs & ~(np.linalg.cond(V) <= MAX_CONDITION)
+        defective = pairs & _ill_conditioned(V)
         if (pairs & ~defective).any():
             k = int(np.flatnonzero(pairs & ~defective)[0])
             row = eigenvalues.reshape(-1, eigenvalues.shape[-1])[k]
@@ -205,6 +206,11 @@ def _drop_rounding(f_y: Array, eigenvalues: Array, V: Array) -> tuple[Array, Arr
     basis = np.where(eigenvalues.imag[..., None, :] < 0.0, V.imag, V.real)
     norm = np.linalg.norm(basis, axis=-2, keepdims=True)
     return eigenvalues.real.copy(), basis / np.where(norm > 0.0, norm, 1.0)
+
+
+def _ill_conditioned(V: NDArray[np.inexact]) -> NDArray[np.bool_]:
+    sigma = np.linalg.svd(V, compute_uv=False)
+    return np.asarray(sigma[..., -1] * MAX_CONDITION < sigma[..., 0])
 
 
 def _where(bad: NDArray[np.bool_]) -> str:
