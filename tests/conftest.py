@@ -8,8 +8,8 @@ import os
 # more of them, badly so when the tests run side by side.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import pytest  # noqa: E402
-from find_browser import MISSING, find_browser  # noqa: E402
+import pytest
+from find_browser import MISSING, find_browser
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ anew with every sub-goal. All worlds of all seeds move in step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -120,45 +120,8 @@ class TwoLevel:
         size = planning.observe(task, self._obs).shape[-1]
         self.replay = Replay(seeds, size, len(planning.low), config.capacity, stream=1)
 
-    def train(
-        self,
-        steps: int,
-        callback: Callable[[dict[str, Any]], object] | None = None,
-        checkpoint: str | Path | None = None,
-        every: int = 50_000,
-        record: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Go on until each seed has made `steps` environment steps.
-
-        Args:
-            steps: of each seed, in all.
-            callback: called after every segment with `steps` and `reward` (seeds,); what it
-                returns is ignored.
-            checkpoint: if given, the state is read from this file if it is there and written to it
-                every `every` steps and at the end, also when interrupted.
-            every: steps between checkpoints.
-            record: study, method and configuration that the checkpoint must carry.
-        """
-        if checkpoint is not None and Path(checkpoint).exists():
-            self.load(checkpoint, record or {})
-        saved = self.steps
-        try:
-            while self.steps < steps:
-                reward = self.segment()
-                if callback is not None:
-                    callback({"steps": self.steps, "reward": reward})
-                if checkpoint is not None and self.steps - saved >= every:
-                    self.save(checkpoint, record or {})
-                    saved = self.steps
-        finally:
-            if checkpoint is not None and self.steps > saved and not self._broken:
-                self.save(checkpoint, record or {})
-
-    _broken = False  # set while a segment is under way: such a state is not saved
-
     def segment(self) -> Array:
         """One sub-goal, its ticks, and the updates that are due; mean rewards (seeds,)."""
-        self._broken = True
         task, planning = self.task, self.planning
         seen = planning.observe(task, self._obs)
         action = self._choose(self._split(seen))
@@ -174,7 +137,6 @@ class TwoLevel:
         self._learn(before)
         if over:
             self._obs = task.reset()
-        self._broken = False
         return reward.mean(1)
 
     def _choose(self, seen: Array) -> Array:

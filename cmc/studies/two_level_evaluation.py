@@ -1,0 +1,167 @@
+"""Tests of the two peg studies: success, contact force, penetration, gains, consistency."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import beta
+from torch import nn
+
+from cmc.envs.panda_task import CRITIC
+from cmc.learning.low_level import Fixed, LowLevel, evaluate
+from cmc.studies.two_level import N, TwoLevelStudy
+
+Array = NDArray[np.float64]
+TEST_SEED = 900_000  # test worlds never share a stream with training
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """What test episodes showed; S seeds, M episodes each, T ticks.
+
+    Attributes:
+        success: at the last tick, (S, M). touched: at any tick, (S, M).
+        total: sum of rewards, (S, M).
+        distance: of the tip to the goal, smallest and at the end, (S, M) each, m.
+        force: at the end of each tick, (T, S, M), N. force_max: over its physics steps, N.
+        penetration: deepest of each episode, (S, M), m.
+    """
+
+    success: NDArray[np.bool_]
+    touched: NDArray[np.bool_]
+    total: Array
+    nearest: Array
+    final: Array
+    force: Array
+    force_max: Array
+    penetration: Array
+
+
+def run_episodes(
+    study: TwoLevelStudy, planner: nn.Module, low: LowLevel, seeds: int, episodes: int
+) -> Episodes:
+    """Run deterministic test episodes of all seeds side by side.
+
+    Args:
+        study: configuration.
+        planner: sub-goals for (seeds, worlds, size).
+        low: the low level.
+        seeds: how many trained seeds S the networks hold.
+        episodes: test episodes of each.
+    """
+    task = study.task_class(study.task, num=seeds * episodes, seed=TEST_SEED)
+    planning, limit = study.planning(), np.array(study.task.u_limit)
+    obs = task.reset()
+    shape = (seeds, episodes)
+    total, deepest = np.zeros(task.num), np.zeros(task.num)
+    nearest, touched = np.full(task.num, np.inf), np.zeros(task.num, dtype=bool)
+    force, force_max = [], []
+    for tick in range(study.task.ticks):
+        if tick % study.task.horizon == 0:
+            seen = planning.observe(task, obs).reshape(*shape, -1)
+            aim = planning.subgoal(evaluate(planner, seen))
+            obs = task.set_subgoal(aim.reshape(task.num, -1))
+        u = low.act(task.select(obs, CRITIC).reshape(*shape, -1), explore=False)
+        obs, reward, _, _, info = task.step(u.reshape(task.num, -1) * limit)
+        missing = task.select(obs, ("goal",)) - task.select(obs, ("position",))
+        distance = np.sqrt((missing**2).sum(-1))
+        total += reward
+        nearest = np.minimum(nearest, distance)
+        touched |= info["success"]
+        deepest = np.maximum(deepest, info["penetration"])
+        force.append(info["contact_force"].reshape(shape).astype(np.float32))
+        force_max.append(info["contact_force_max"].reshape(shape).astype(np.float32))
+    return Episodes(
+        info["success"].reshape(shape),
+        touched.reshape(shape),
+        total.reshape(shape),
+        nearest.reshape(shape),
+        distance.reshape(shape),
+        np.array(force),
+        np.array(force_max),
+        deepest.reshape(shape),
+    )
+
+
+def summary(found: Episodes) -> dict[str, Any]:
+    """Figures of test episodes, per seed where they differ; JSON."""
+    shares = {}
+    for rule, force in (("at_50_hz", found.force), ("largest", found.force_max)):
+        shares[rule] = {
+            "zero": float((force == 0).mean()),
+            "below_1_N": float((force < 1).mean()),
+            "below_5_N": float((force < 5).mean()),
+            "largest_N": float(force.max()),
+        }
+    return {
+        "episodes": found.success.shape[1],
+        "success": found.success.mean(1).tolist(),
+        "success_interval": interval(int(found.success.sum()), found.success.size),
+        "touched": found.touched.mean(1).tolist(),
+        "touched_interval": interval(int(found.touched.sum()), found.touched.size),
+        "return": found.total.mean(1).tolist(),
+        "nearest_mm": (1e3 * np.median(found.nearest, axis=1)).tolist(),
+        "final_mm": (1e3 * np.median(found.final, axis=1)).tolist(),
+        "force": shares,
+        "penetration_mm": (1e3 * found.penetration.max(1)).tolist(),
+    }
+
+
+def interval(hits: int, tries: int, level: float = 0.95) -> list[float]:
+    """Clopper-Pearson interval of a share; exact, and blind to differences between seeds."""
+    tail = (1 - level) / 2
+    low = beta.ppf(tail, hits, tries - hits + 1) if hits else 0.0
+    high = beta.ppf(1 - tail, hits + 1, tries - hits) if hits < tries else 1.0
+    return [float(low), float(high)]
+
+
+def consistency(
+    study: TwoLevelStudy, low: LowLevel, seeds: int, starts: int = 16
+) -> dict[str, Array]:
+    """Spread of the tip's displacement over one segment, for one sub-goal and many starts.
+
+    Every world starts an episode anew, is moved by a random sub-goal for one segment (so that it
+    starts the next one in motion), and is then asked for a 5 mm step in x.
+
+    Returns:
+        `mean` and `spread` (standard deviation over starts) of the displacement along the step,
+        per seed, (seeds,), m.
+    """
+    task = study.task_class(study.task, num=seeds * starts, seed=TEST_SEED + 1)
+    rng = np.random.default_rng(TEST_SEED)
+    low_end, high_end = np.array(study.task.subgoal_low), np.array(study.task.subgoal_high)
+    task.reset()
+    first = rng.uniform(low_end, high_end, (starts, len(low_end)))
+    obs = task.set_subgoal(np.tile(first, (seeds, 1)))
+    _ticks(task, low, obs, seeds, study)
+    before = task.worlds.tip.copy()
+    step = np.zeros((task.num, len(low_end)))
+    if not study.task.increments:
+        step[:, :3] = before
+    step[:, 0] += 0.005
+    obs = task.set_subgoal(step)
+    _ticks(task, low, obs, seeds, study)
+    moved = (task.worlds.tip - before)[:, 0].reshape(seeds, starts)
+    return {"mean": moved.mean(1), "spread": moved.std(1)}
+
+
+def _ticks(task: Any, low: LowLevel, obs: Array, seeds: int, study: TwoLevelStudy) -> None:
+    limit = np.array(study.task.u_limit)
+    for _ in range(study.task.horizon):
+        seen = task.select(obs, CRITIC).reshape(seeds, task.num // seeds, -1)
+        u = low.act(seen, explore=False)
+        obs, *_ = task.step(u.reshape(task.num, N) * limit)
+
+
+def slope_at_rest(study: TwoLevelStudy, low: LowLevel, seeds: int, eps: float = 1e-4) -> Array:
+    """Slope du/dy at rest of every dimension, (seeds, 6), by a central difference."""
+    if isinstance(low, Fixed) and low.actor is None:
+        return np.zeros((seeds, N))
+    seen = np.zeros((seeds, 2 * N, 4 * N + 1))
+    index = np.arange(N)
+    seen[:, index, index], seen[:, N + index, index] = eps, -eps
+    u = low.act(seen, explore=False)
+    return (u[:, index, index] - u[:, N + index, index]) / (2 * eps)
