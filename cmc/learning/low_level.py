@@ -162,7 +162,9 @@ class CriticLow:
 
     def record(self, segment: Segment) -> None:
         """Store every tick of the segment, with its reward or with its return to go."""
-        reward = sum(weight * segment.tracking[name] for name, weight in self.weights.items())
+        reward = np.zeros(segment.force.shape)
+        for name, weight in self.weights.items():
+            reward += weight * segment.tracking[name]
         continues = np.ones_like(reward)
         continues[-1] = 0.0
         if self.whole_return:
