@@ -20,6 +20,7 @@ from cmc.theory.combinations import feedback
 from cmc.theory.contraction import contraction_rate, rate_from_cloud
 from cmc.theory.exact import Region, closed_loop, total_jacobian
 from cmc.theory.metric_search import condition_metric, search_metric
+from cmc.theory.sampled import largest_slope
 from cmc.theory.simulate import rk4
 
 
@@ -464,4 +465,63 @@ def test_complex_pairs_are_certified_with_the_feedback_transform():
             to_aux = np.block([[space.T_y, np.zeros((2, 2))], [np.zeros((2, 2)), np.eye(2)]])
             J = to_aux @ J @ np.linalg.inv(to_aux)
             assert contraction_rate(J, answer.metric).min() >= answer.rate - 1e-6
+    assert held >= 3
+
+
+def test_exact_sampled_certificate_of_the_peg_is_obeyed_by_the_peg_itself():
+    """The certificate uses the contact model; the trajectories here use the plant's own step."""
+    peg, h, goal = plants.get("peg", K_sur=31.0), 0.01, np.array([2.0, -1.5])
+    caps = [largest_slope(peg.tau_x, 1.0, h, ratio=5.0), largest_slope(0.01, 31.0, h, ratio=5.0)]
+    top = 0.5 * np.array(caps)[:, None] * [1.0, 5.0]
+    pol = Policy(0.3 * top, 0.7 * top)
+    pol.u0 = np.array([2.0, -0.05])
+    box = Region([1.5, -2.5], [2.5, -0.5], integral=0.2, points=4)
+    answer = certify(pol, peg, kind="exact", region=box, h=h, y_ref=goal)
+    assert answer, str(answer)
+    assert (answer.kind, answer.domain) == ("exact", "sampled")
+    x, force = np.array([1.9, 2.1, 2.0]), np.array([-1.4, -1.6, -1.5])
+    z, I, path = peg.height(x, force), np.zeros((3, 2)), []
+    for _ in range(120):
+        y = np.stack([x, peg.contact_force(x, z)], axis=-1)
+        path.append(np.concatenate([y, I], axis=-1))
+        held = peg.hold(y)
+        space = decompose(peg.f_y(y, held), peg.f_u(y, held))
+        signal = space.to_z(y - goal)
+        I = I + h * signal
+        u = pol.u0 + space.to_u(-pol.pi(np.stack([signal, I], axis=-1)))
+        x, z = peg.step(x, z, u, h)
+    path = np.stack(path)
+    assert (path[..., 1] < -0.5).all()
+    assert (np.abs(path[..., 2:]) < 0.2).all()
+    measured = rate_from_cloud(h * np.arange(len(path)), path, answer.metric)
+    assert (measured.ratio <= np.exp(-answer.rate * measured.times) * (1 + 1e-6)).all()
+
+
+@pytest.mark.parametrize("h", [None, 0.03])
+def test_random_plants_of_three_dimensions_keep_their_promise(h):
+    """Any slopes inside the bounds, against a loop that is written down afresh."""
+    rng, held = np.random.default_rng(10), 0
+    for _ in range(6):
+        V = rng.normal(size=(3, 3)) + 2 * np.eye(3)
+        A = V @ np.diag(-rng.uniform(0.5, 3, 3)) @ np.linalg.inv(V)
+        plant = plants.LinearPlant(A, rng.normal(size=(3, 3)))
+        bypass = rng.uniform(0.2, 1.0, (3, 2))
+        pol = Policy(bypass, bypass * 0.3)
+        answer = certify(pol, plant, h=h)
+        held += answer.holds
+        if not answer:
+            continue
+        space = decompose(A, plant.B)
+        slopes = bypass * rng.uniform(1, 1.3, (200, 3, 2))
+        K1, K2 = (slopes[:, None, :, m] * np.eye(3) for m in (0, 1))
+        if h is None:
+            top = np.concatenate([space.Lambda - space.R @ K1, -space.R @ K2], axis=-1)
+            below = np.broadcast_to(np.eye(3, 6), top.shape)
+        else:
+            phi = expm(h * space.Lambda)
+            G = np.linalg.solve(space.Lambda, (phi - np.eye(3)) @ space.R)
+            top = np.concatenate([phi - G @ (K1 + h * K2), -G @ K2], axis=-1)
+            below = np.broadcast_to(np.hstack([h * np.eye(3), np.eye(3)]), top.shape)
+        loops = np.concatenate([top, below], axis=-2)
+        assert rate_in(loops, answer.metric, h) >= answer.rate - 1e-7
     assert held >= 3
