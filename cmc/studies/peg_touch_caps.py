@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -116,7 +116,8 @@ def compare(
     episodes: int = 5000,
     trajectories: int = 2000,
     shifts: Sequence[str] = tuple(SHIFTS),
-    progress: Callable[[str, dict[str, Any]], object] | None = None,
+    finished: Mapping[str, dict[str, Any]] | None = None,
+    progress: Callable[[str, dict[str, dict[str, Any]]], object] | None = None,
 ) -> dict[str, Any]:
     """Train and test variants; one entry each, with the cost against "none" where it is there.
 
@@ -126,7 +127,8 @@ def compare(
         episodes: training episodes of each seed.
         trajectories: of each test and seed.
         shifts: of the plant in the tests, "nominal" among them.
-        progress: called with each finished entry.
+        finished: entries of an earlier call with the same numbers, not to be repeated.
+        progress: called with the name of each new entry and all entries so far.
 
     Raises:
         ValueError: for an unknown variant.
@@ -134,8 +136,11 @@ def compare(
     names = list(names)
     if unknown := set(names) - set(VARIANTS):
         raise ValueError(f"variants: wanted some of {sorted(VARIANTS)}, got {sorted(unknown)}")
-    study, answer = PegTouchStudy(), {}
+    study = PegTouchStudy()
+    answer: dict[str, dict[str, Any]] = dict(finished or {})
     for name in names:
+        if name in answer:
+            continue
         variant, start = VARIANTS[name], time.process_time()
         policy, returns = train(variant, list(seeds), episodes, study)
         answer[name] = _tested(policy, variant, len(seeds), trajectories, shifts, study)
@@ -148,7 +153,7 @@ def compare(
             own, free = answer[name]["return"], answer["none"]["return"]
             answer[name]["cost"] = round(float(np.mean(own) / np.mean(free)) - 1.0, 4)
         if progress is not None:
-            progress(name, answer[name])
+            progress(name, answer)
     return answer
 
 
@@ -192,23 +197,25 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("assets/results") / RESULT)
     chosen = parser.parse_args()
     seeds = list(range(chosen.seeds))
+    numbers = {"episodes": chosen.episodes, "trajectories": chosen.trajectories}
     command = (
         f"python -m cmc.studies.peg_touch_caps --seeds {chosen.seeds} "
         f"--episodes {chosen.episodes} --trajectories {chosen.trajectories}"
     )
+    made = {**store.provenance(command, seeds), **numbers}
+    finished: dict[str, Any] = {}
+    if chosen.out.is_file():
+        found = store.read_json(chosen.out)
+        if found.get("command") == command:  # go on where an earlier run stopped
+            finished = found["variants"]
 
-    def show(name: str, row: dict[str, Any]) -> None:
+    def show(name: str, rows: dict[str, dict[str, Any]]) -> None:
+        row = rows[name]
         cost, worst = row.get("cost"), max(row["oscillation"].values())
         print(f"{name:16} return {np.mean(row['return']):7.2f} cost {cost} worst {worst}")
+        store.write_json(chosen.out, {**made, "variants": rows})
 
-    found = compare(
-        chosen.variants,
-        seeds=seeds,
-        episodes=chosen.episodes,
-        trajectories=chosen.trajectories,
-        progress=show,
-    )
-    store.write_json(chosen.out, {**store.provenance(command, seeds), "variants": found})
+    compare(chosen.variants, seeds=seeds, finished=finished, progress=show, **numbers)
 
 
 if __name__ == "__main__":
