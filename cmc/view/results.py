@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +21,7 @@ def curves(
     *,
     labels: tuple[str, str],
     log: str = "",
+    colors: Sequence[str] = CYCLE,
     title: str | None = None,
     marks: Mapping[str, float] | None = None,
     ax: Axes | None = None,
@@ -32,14 +33,15 @@ def curves(
         lines: legend entry to ordinate (points,).
         labels: axis labels with units.
         log: which axes are logarithmic: `""`, `"x"`, `"y"` or `"xy"`.
+        colors: one for each curve, in order; from the second round on the lines are dashed.
         title: optional title.
         marks: legend entry to a level that is marked by a horizontal line.
         ax: where to draw.
     """
     ax = axes_or_new(ax)
     for k, (name, y) in enumerate(lines.items()):
-        style = ("-", "--", "-.", ":")[(k // len(CYCLE)) % 4]
-        ax.plot(x, y, style, color=CYCLE[k % len(CYCLE)], label=name)
+        style = ("-", "--", "-.", ":")[(k // len(colors)) % 4]
+        ax.plot(x, y, style, color=colors[k % len(colors)], label=name)
     for name, level in (marks or {}).items():
         ax.axhline(level, color=NEUTRAL, ls="--", lw=1.2, label=name)
     if "x" in log:
@@ -58,6 +60,7 @@ def histogram(
     label_x: str,
     bins: int | ArrayLike = 40,
     log: bool = False,
+    colors: Sequence[str] = CYCLE,
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Figure:
@@ -70,6 +73,7 @@ def histogram(
         label_x: axis label with unit.
         bins: number of common bins, or their edges.
         log: draw shares on a logarithmic axis.
+        colors: one for each sample, in order.
         title: optional title.
         ax: where to draw.
     """
@@ -79,7 +83,7 @@ def histogram(
     for k, (name, x) in enumerate(flat.items()):
         count = np.histogram(np.clip(x, edges[0], edges[-1]), edges)[0]
         share = count / max(x.size, 1)
-        color = CYCLE[k % len(CYCLE)]
+        color = colors[k % len(colors)]
         ax.stairs(share, edges, color=color, fill=True, alpha=0.25)
         ax.stairs(share, edges, color=color, lw=1.8, label=name)
     if log:
@@ -96,6 +100,7 @@ def learning_curves(
     *,
     labels: tuple[str, str] = ("environment steps", "return"),
     each_seed: bool = True,
+    colors: Sequence[str] = CYCLE,
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Figure:
@@ -106,6 +111,7 @@ def learning_curves(
         runs: method to values (seeds, points); NaN where a seed has no value.
         labels: axis labels with units.
         each_seed: draw every seed as a thin line too.
+        colors: one for each method, in order.
         title: optional title.
         ax: where to draw.
     """
@@ -115,7 +121,7 @@ def learning_curves(
         Y = np.atleast_2d(np.asarray(values, float))
         if Y.shape[-1] != x.size:
             raise ValueError(f"{name}: wanted (seeds, {x.size}) values, got shape {Y.shape}")
-        color = CYCLE[k % len(CYCLE)]
+        color = colors[k % len(colors)]
         seeds = f" ({Y.shape[0]} seeds)" if Y.shape[0] > 1 else ""
         ax.plot(x, np.nanmedian(Y, axis=0), color=color, lw=2.2, label=f"{name}{seeds}")
         if Y.shape[0] > 1:
