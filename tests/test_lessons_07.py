@@ -34,6 +34,16 @@ def test_ladder_descends_from_the_paper_to_what_happens():
     assert steps[-3] < 4 * steps[-2]
 
 
+def test_worst_disturbances_stay_below_the_bound_and_above_the_random_ones():
+    drawn = lesson_07.in_metric()
+    for course in drawn["courses"].values():
+        assert (course <= drawn["bound"] * (1 + 1e-9) + 1e-12).all()
+    last = {name: course[-1] for name, course in drawn["courses"].items()}
+    assert last["worst signal, worst fixed slopes"] >= last["worst constant, worst fixed slopes"]
+    assert last["worst signal, worst fixed slopes"] > 0.2 * drawn["bound"][-1]
+    assert last["largest of the random ones"] < last["worst signal, worst fixed slopes"]
+
+
 def test_jacobian_of_the_loop_lies_within_the_corners_that_are_certified():
     this = lesson_07.example()
     rng = np.random.default_rng(0)

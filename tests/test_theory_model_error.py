@@ -9,7 +9,6 @@ from cmc.theory.contraction import contraction_rate
 from cmc.theory.differential import F1
 from cmc.theory.model_error import (
     error_size,
-    largest_mismatch,
     model_error_metric_test,
     model_error_paper_test,
     nominal_metric,
@@ -133,12 +132,6 @@ def test_a_metric_made_for_all_models_passes_all_of_them():
     verdict = model_error_metric_test(corners[0], corners, metric=found.metric)
     assert verdict.holds.all()
     assert verdict.real_rate.min() == pytest.approx(found.rate)
-
-
-def test_largest_mismatch_finds_an_edge():
-    assert largest_mismatch(lambda s: s < 0.7321, upper=2.0) == pytest.approx(0.7321, abs=1e-5)
-    assert largest_mismatch(lambda s: True, upper=3.0) == 3.0
-    assert np.isnan(largest_mismatch(lambda s: False))
 
 
 def test_bad_input_is_refused():

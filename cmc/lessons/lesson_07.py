@@ -21,7 +21,12 @@ from cmc.policies import ModularPolicy, PositiveNetwork
 from cmc.theory.auxiliary import AuxiliarySpace, decompose
 from cmc.theory.certificates import Certificate, common_metric, loop_jacobian
 from cmc.theory.certify import certify
-from cmc.theory.disturbance import peak_gain, random_disturbances
+from cmc.theory.disturbance import (
+    peak_gain,
+    random_disturbances,
+    worst_constant,
+    worst_signal,
+)
 from cmc.theory.reach import Ellipsoid, reach, shape_metric
 from cmc.theory.robustness import ErrorBall, respond
 
@@ -127,6 +132,38 @@ def differences(
     path = respond(this.rhs, pair, times, push)
     drift: Array = np.subtract(path[:, count:], path[:, :count])
     return np.asarray(times, dtype=np.float64), drift
+
+
+def in_metric(size: float = 1.0, seconds: float = 15.0) -> dict[str, Any]:
+    """Distances in the certificate's metric under the worst disturbances, beside the bound.
+
+    The worst constant is exact for slopes fixed at the worst corner; the worst signal is aimed at
+    the same displacement. Both are then applied to the real loop.
+
+    Returns:
+        Times `t`, the `bound`, and the distances `courses` by name, (T,) each.
+    """
+    this = example()
+    ball = balls()["certificate"]
+    corner = max(this.corners, key=lambda J: worst_constant(J, this.channel, ball.metric)[0])
+    length, d = worst_constant(corner, this.channel, ball.metric)
+    row = ball.metric @ np.linalg.solve(corner, -this.channel @ d) / length
+    times = STEP * np.arange(round(seconds / STEP) + 1)
+    signal, _ = worst_signal(corner, this.channel, row, times)
+    constant = np.broadcast_to(d, signal.shape)
+    calm = np.zeros((len(times) - 1, 4))
+    push = np.stack([calm, size * constant @ this.channel.T, size * signal @ this.channel.T], 1)
+    fixed = respond(lambda t, s: s @ corner.T, np.zeros((3, 4)), times, push)
+    real = respond(this.rhs, np.zeros((3, 4)), times, push)
+    random = differences(size, budget(2000, 500), seconds, apart=0.0)[1]
+    courses = {
+        "worst signal, worst fixed slopes": ball.distance(fixed[:, 2]),
+        "worst constant, worst fixed slopes": ball.distance(fixed[:, 1]),
+        "worst signal, real loop": ball.distance(real[:, 2] - real[:, 0]),
+        "worst constant, real loop": ball.distance(real[:, 1] - real[:, 0]),
+        "largest of the random ones": ball.distance(random).max(axis=1),
+    }
+    return {"t": times, "bound": ball.bound(times, 0.0, size), "courses": courses}
 
 
 @cache

@@ -123,15 +123,16 @@ def mismatch_map(points: int = 41) -> dict[str, Array]:
     return {"factors": factors, "rate": rate, "margin": margin}
 
 
-def _force_loop(tau: ArrayLike, stiffness: ArrayLike) -> Array:
+def force_loop(tau: ArrayLike, stiffness: ArrayLike) -> Array:
+    """Jacobian of the peg's force loop for a lag (s) and a stiffness, slopes 0.05 and 1.5 / s."""
     lam, gain = -1.0 / np.asarray(tau, float), np.asarray(stiffness, float) / tau
     return loop_jacobian(lam[..., None, None], gain[..., None, None], [-0.05], [-1.5])
 
 
 def _force_rate(tau: ArrayLike, stiffness: ArrayLike) -> Array:
-    nominal = _force_loop(0.01, 16.0)
+    nominal = force_loop(0.01, 16.0)
     metric = nominal_metric(nominal)
-    return model_error_metric_test(nominal, _force_loop(tau, stiffness), metric=metric).real_rate
+    return model_error_metric_test(nominal, force_loop(tau, stiffness), metric=metric).real_rate
 
 
 def mismatch(tau: float, stiffness: float) -> dict[str, Any]:
@@ -141,7 +142,7 @@ def mismatch(tau: float, stiffness: float) -> dict[str, Any]:
         tau: factor on tau_z.
         stiffness: factor on K_sur.
     """
-    nominal, real = _force_loop(0.01, 16.0), _force_loop(0.01 * tau, 16.0 * stiffness)
+    nominal, real = force_loop(0.01, 16.0), force_loop(0.01 * tau, 16.0 * stiffness)
     rate = float(_force_rate(0.01 * tau, 16.0 * stiffness))
     h = 0.01
     margin = float(sampled_margin(0.05, 1.5, 0.01 * tau, 16.0 * stiffness, h))

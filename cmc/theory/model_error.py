@@ -17,28 +17,16 @@ coordinates is `loop_jacobian(space.Lambda, space.R, p, q)` of `cmc.theory.certi
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmc.theory.contraction import contraction_rate, metric_factor
+from cmc.theory.margins import symmetric_bound
+from cmc.theory.spectrum import checked_square
 
 Array = NDArray[np.float64]
-
-
-def _symmetric(matrix: Array) -> Array:
-    return 0.5 * (matrix + np.swapaxes(matrix, -1, -2))
-
-
-def _square(name: str, matrix: ArrayLike) -> Array:
-    value = np.asarray(matrix, float)
-    if value.ndim < 2 or value.shape[-1] != value.shape[-2]:
-        raise ValueError(f"wanted {name} of shape (..., n, n), got {value.shape}")
-    if not np.isfinite(value).all():
-        raise ValueError(f"{name} is not finite")
-    return value
 
 
 @dataclass(frozen=True)
@@ -66,11 +54,11 @@ def model_error_paper_test(
         F1_real: F1 of the real plant under the model's T_y, T_a, (..., 2n, 2n).
         nu_plus: upper bound of the eigenvalues of F2^T + F2, 1/s.
     """
-    hat, real = _square("F1_hat", F1_hat), _square("F1_real", F1_real)
+    hat, real = checked_square(F1_hat, "F1_hat"), checked_square(F1_real, "F1_real")
     scale = 1e-12 * (1.0 + np.abs(hat).max(axis=(-2, -1)))  # equality is allowed
-    above = np.linalg.eigvalsh(2.0 * _symmetric(real - hat))[..., -1]
-    largest = np.linalg.eigvalsh(2.0 * _symmetric(hat))[..., -1]
-    return PaperTest(above <= scale, largest < -np.maximum(nu_plus, 0.0))
+    order = symmetric_bound(real - hat) <= scale
+    # symmetric_bound halves F1^T + F1, the paper's inequality does not
+    return PaperTest(order, 2.0 * symmetric_bound(hat) < -np.maximum(nu_plus, 0.0))
 
 
 def nominal_metric(jacobian: ArrayLike, *, share: float = 0.5) -> Array:
@@ -89,7 +77,7 @@ def nominal_metric(jacobian: ArrayLike, *, share: float = 0.5) -> Array:
     Raises:
         ValueError: if a loop is not stable or `share` is outside of [0, 1).
     """
-    J = _square("the Jacobian", jacobian)
+    J = checked_square(jacobian, "jacobian")
     if not 0.0 <= share < 1.0:
         raise ValueError(f"wanted a share in [0, 1), got {share!r}")
     abscissa = np.linalg.eigvals(J).real.max(axis=-1)
@@ -105,7 +93,8 @@ def nominal_metric(jacobian: ArrayLike, *, share: float = 0.5) -> Array:
     kronecker = kronecker + np.einsum("ij,...kl->...ikjl", eye, shifted)
     flat = kronecker.reshape(*J.shape[:-2], n * n, n * n)
     right = np.broadcast_to(-eye.reshape(-1, 1), (*J.shape[:-2], n * n, 1))
-    return _symmetric(np.linalg.solve(flat, right).reshape(J.shape))
+    metric = np.linalg.solve(flat, right).reshape(J.shape)
+    return 0.5 * (metric + np.swapaxes(metric, -1, -2))
 
 
 @dataclass(frozen=True)
@@ -140,7 +129,7 @@ def model_error_metric_test(
         metric: a metric to use, for example a certificate's; `nominal_metric` by default.
         share: passed to `nominal_metric`.
     """
-    model, plant = _square("the model's Jacobian", nominal), _square("the real Jacobian", real)
+    model, plant = checked_square(nominal, "nominal"), checked_square(real, "real")
     M = nominal_metric(model, share=share) if metric is None else np.asarray(metric, float)
     return MetricTest(M, contraction_rate(model, M), contraction_rate(plant, M))
 
@@ -159,29 +148,3 @@ def error_size(nominal: ArrayLike, real: ArrayLike, metric: ArrayLike) -> Array:
     theta = metric_factor(metric)
     error = np.asarray(real, float) - np.asarray(nominal, float)
     return np.linalg.norm(theta @ error @ np.linalg.inv(theta), 2, axis=(-2, -1))
-
-
-def largest_mismatch(
-    passes: Callable[[float], bool], *, upper: float = 10.0, steps: int = 40
-) -> float:
-    """Largest s in [0, upper] such that `passes` holds from 0 up to s, by a scan and a bisection.
-
-    Args:
-        passes: whether a loop with mismatch s passes a test.
-        upper: end of the search.
-        steps: points of the scan; narrower gaps between failures go unseen.
-
-    Returns:
-        s, or NaN if the test fails without mismatch.
-    """
-    grid = np.linspace(0.0, upper, steps + 1)
-    if not passes(0.0):
-        return float("nan")
-    failing = next((s for s in grid[1:] if not passes(float(s))), None)
-    if failing is None:
-        return upper
-    low, high = float(failing - grid[1]), float(failing)
-    while high - low > 1e-6 * upper:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if passes(middle) else (low, middle)
-    return low

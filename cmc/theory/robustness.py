@@ -68,7 +68,7 @@ class ErrorBall:
     def of(
         cls, certificate: Certificate, channel: ArrayLike | None = None, period: float | None = None
     ) -> ErrorBall:
-        """Ball of a certified loop.
+        """Ball of a certified loop, while both trajectories stay in the certificate's region.
 
         Args:
             certificate: one that holds and is exact: its metric and rate are used.
