@@ -98,6 +98,7 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
     | `num_envs`       | int                 | 1          | trajectories                        |
     | `config`         | PegTouchConfig      | training   | every number of the task            |
     | `autoreset_mode` | AutoresetMode       | SAME_STEP  | or DISABLED: states stay after the end |
+    | `privileged`     | bool                | True       | whether info carries `privileged`   |
     | other keywords   | fields of config    |            | replace single fields               |
 
     ## Version history
@@ -113,6 +114,7 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
         num_envs: int = 1,
         config: PegTouchConfig | None = None,
         autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
+        privileged: bool = True,
         **overrides: Any,
     ) -> None:
         if num_envs < 1:
@@ -123,6 +125,7 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
         self.config = replace(config or PegTouchConfig(), **overrides)
         self.num_envs = num_envs
         self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
+        self._with_privileged = privileged
         self._same_step = autoreset_mode is AutoresetMode.SAME_STEP
         c = self.config
         self.single_action_space = spaces.Box(-c.action_limit, c.action_limit, (2,), np.float32)
@@ -160,7 +163,7 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
         if mask.shape != (self.num_envs,):
             raise ValueError(f"reset_mask: wanted shape ({self.num_envs},), got {mask.shape}")
         self._restart(mask, options.get("parameters", {}))
-        return self._observe(), {"privileged": self._privileged()}
+        return self._observe(), self._info()
 
     def step(
         self, actions: ArrayLike
@@ -195,12 +198,13 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
         reward = terms["position"] + terms["force"]
         truncated = self.steps >= c.horizon
         obs = self._observe()
-        info: dict[str, Any] = {"reward_terms": terms, "privileged": self._privileged()}
+        info: dict[str, Any] = {"reward_terms": terms, **self._info()}
         if self._same_step and truncated.any():
             info |= {"final_obs": obs, "_final_obs": truncated}
-            info |= {"final_info": {"privileged": info["privileged"]}, "_final_info": truncated}
+            info |= {"final_info": self._info(), "_final_info": truncated}
             self._restart(truncated, {})
-            obs, info["privileged"] = self._observe(), self._privileged()
+            obs = self._observe()
+            info |= self._info()
         return obs, reward, np.zeros(self.num_envs, dtype=bool), truncated, info
 
     def transforms(self) -> tuple[Array, Array]:
@@ -296,7 +300,10 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
             columns = [signal[:, 0], integral[:, 0], signal[:, 1], integral[:, 1]]
         return np.stack(columns, axis=-1).astype(np.float32)
 
-    def _privileged(self) -> NDArray[np.float32]:
+    def _info(self) -> dict[str, NDArray[np.float32]]:
+        """What a critic may know, if it is wanted."""
+        if not self._with_privileged:
+            return {}
         s, (x, z), error = self.sampled, self.position.T, self.error
         scaled = [
             error[:, 0],
@@ -310,7 +317,7 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
             100.0 * s["surface_sin"],
             100.0 * s["surface_cos"],
         ]
-        return np.stack(scaled, axis=-1).astype(np.float32)
+        return {"privileged": np.stack(scaled, axis=-1).astype(np.float32)}
 
 
 class PegTouchEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):

@@ -71,7 +71,8 @@ def judge(error: ArrayLike, h: float, config: DetectorConfig | None = None) -> V
             there are thresholds, or is not finite.
     """
     config = config or DetectorConfig()
-    e = np.asarray(error, dtype=np.float64)
+    e = np.asarray(error)
+    e = e if e.dtype == np.float32 else e.astype(np.float64)
     if e.ndim != 3 or e.shape[-1] != len(config.threshold):
         raise ValueError(f"error: wanted (time, batch, {len(config.threshold)}), got {e.shape}")
     count = round(config.window / h)
@@ -84,7 +85,7 @@ def judge(error: ArrayLike, h: float, config: DetectorConfig | None = None) -> V
     if not np.isfinite(tail).all():
         raise ValueError("error: wanted finite values, got NaN or infinity")
     threshold = np.asarray(config.threshold)
-    time = (np.arange(count) - (count - 1) / 2) * h
+    time = ((np.arange(count) - (count - 1) / 2) * h).astype(e.dtype)
     trend = np.tensordot(time, tail, axes=(0, 0)) / np.sum(time**2)
     residual = tail - tail.mean(axis=0) - time[:, None, None] * trend
     half = count // 2

@@ -73,7 +73,7 @@ def record(
 ) -> Recording:
     """Run a policy with its leading axis of `seeds` on the same trajectories for each seed."""
     num = test.trajectories
-    envs = PegTouchVectorEnv(seeds * num, config, AutoresetMode.DISABLED)
+    envs = PegTouchVectorEnv(seeds * num, config, AutoresetMode.DISABLED, privileged=False)
     steps, count = round(test.duration / config.h), round(test.detectors.window / config.h)
     obs, _ = envs.reset(seed=[test.seed] * seeds)
     returns = np.zeros(seeds * num)

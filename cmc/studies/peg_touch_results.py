@@ -27,7 +27,7 @@ from cmc.studies.peg_touch_training import (
 
 Progress = Callable[[int, int, str], object]
 Folder = str | Path | None
-Planned = tuple[int | None, str, float]
+KEYS = ("episode", "shift", "h", "trajectories")
 SPARSE = (1000, 5000, 10_000, 15_000)
 """Kept policies at which every method is tested."""
 SIDE = 2000
@@ -44,11 +44,12 @@ FULL = ("cppo", "ppo", "cppo_capped", "cppo_bounded")
 """Methods tested with all trajectories, the others with `SIDE`."""
 
 
-def plan(name: str, checkpoints: Folder = None) -> list[Planned]:
-    """The tests of a method: episode (None for fixed gains), shift, control period."""
-    h = PegTouchStudy().task.h
+def plan(name: str, test: TestConfig, checkpoints: Folder = None) -> list[dict[str, Any]]:
+    """The tests of a method: `episode` (None for fixed gains), `shift`, `h`, `trajectories`."""
+    h, few = PegTouchStudy().task.h, min(SIDE, test.trajectories)
     marks: list[int | None] = [None]
     dense = broad = timed = marks
+    number = test.trajectories
     if method(name).trained:
         kept, _ = contents(name, _path(name, checkpoints))
         marks = [*kept]
@@ -56,10 +57,13 @@ def plan(name: str, checkpoints: Folder = None) -> list[Planned]:
         broad = [*sorted({paper_mark(kept), kept[-1] if name in FULL else paper_mark(kept)})]
         broad = marks if name in EVERY_SHIFT else broad
         timed = [paper_mark(kept)] if name in TIMED else []
-    tests: list[Planned] = [(mark, "nominal", h) for mark in dense]
-    tests += [(mark, shift, h) for mark in broad for shift in SHIFTS if shift != "nominal"]
-    tests += [(mark, "nominal", other) for mark in timed for other in SAMPLE_TIMES if other != h]
-    return tests
+        number = test.trajectories if name in FULL else few
+    tests = [(mark, "nominal", h, number) for mark in dense]
+    tests += [(mark, shift, h, number) for mark in broad for shift in SHIFTS if shift != "nominal"]
+    tests += [
+        (mark, "nominal", other, few) for mark in timed for other in SAMPLE_TIMES if other != h
+    ]
+    return [dict(zip(KEYS, values, strict=True)) for values in tests]
 
 
 def evaluate(
@@ -70,12 +74,12 @@ def evaluate(
     checkpoints: Folder = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Test the shipped policies and collect every figure; finished methods are not repeated.
+    """Test the shipped policies and collect every figure; finished tests are not repeated.
 
     Args:
         names: methods; all that have a checkpoint, and the fixed ones, if None.
         trajectories: for each test and seed; the study's 8000 if None.
-        folder: where each method's answer is kept, so that an interrupted evaluation goes on.
+        folder: where each method's tests are kept, so that an interrupted evaluation goes on.
         checkpoints: folder of checkpoint files; the shipped ones if None.
         progress: called with (tests done, tests in all, what is next).
 
@@ -89,25 +93,19 @@ def evaluate(
     if trajectories is not None and trajectories < 1:
         raise ValueError(f"trajectories: wanted at least 1, got {trajectories}")
     test = TestConfig() if trajectories is None else TestConfig(trajectories=trajectories)
-    plans = {name: plan(name, checkpoints) for name in wanted}
-    total, done = sum(map(len, plans.values())), 0
+    total, done = sum(len(plan(name, test, checkpoints)) for name in wanted), 0
     methods: dict[str, Any] = {}
     for name in wanted:
-        kept = Path(folder) / f"{name}.json"
-        mark = _fingerprint(name, test, checkpoints)
-        found = store.read_json(kept) if kept.is_file() else {}
-        if found.get("fingerprint") != mark:
 
-            def step(count: int, what: str, name: str = name, before: int = done) -> None:
-                if progress is not None:
-                    progress(before + count, total, f"{name}, {what}")
+        def step(count: int, what: str, before: int = done) -> None:
+            if progress is not None:
+                progress(before + count, total, what)
 
-            found = {"fingerprint": mark, **evaluate_method(name, test, step, checkpoints)}
-            store.write_json(kept, found)
-        methods[name] = {key: value for key, value in found.items() if key != "fingerprint"}
-        done += len(plans[name])
-        if progress is not None:
-            progress(done, total, name)
+        file = Path(folder) / f"{name}.json"
+        methods[name] = evaluate_method(name, test, file, step, checkpoints)
+        done += len(methods[name]["tests"])
+    if progress is not None:
+        progress(done, total, "done")
     answer = {"study": NAME, "test": asdict(test), "methods": methods, "totals": totals(methods)}
     answer["claims"] = claims(methods) if {"ppo", "cppo"} <= set(methods) else {}
     seeds: list[int] = max((found["seeds"] for found in methods.values()), key=len, default=[])
@@ -117,40 +115,61 @@ def evaluate(
 def evaluate_method(
     name: str,
     test: TestConfig,
+    file: Path,
     step: Callable[[int, str], object] | None = None,
     checkpoints: Folder = None,
 ) -> dict[str, Any]:
-    """All tests of one method, its learning curve and its certificates."""
-    arm, study, path = method(name), PegTouchStudy(), _path(name, checkpoints)
-    answer: dict[str, Any] = {"title": arm.title, "seeds": [], "tests": [], "training": {}}
-    if arm.trained:
-        episodes, returns = learning_curve(name, path)
-        size = min(240 // study.episodes_per_update, len(returns))
-        count = len(returns) // size
-        smooth = returns[: count * size].reshape(count, size, -1).mean(axis=1)
-        answer["training"] = {
-            "episode": episodes[size - 1 :: size][:count].tolist(),
-            "return": np.round(smooth, 3).tolist(),
-        }
-        answer["seeds"] = contents(name, path)[1]["seeds"]
-    predict = None
-    if arm.interface != "raw":
-        predict = "weights" if arm.contracting and "no_integral" not in name else "visited"
-    for count, (mark, shift, h) in enumerate(plan(name, checkpoints)):
+    """All tests of one method, its learning curve and its certificates.
+
+    Args:
+        name: the method.
+        test: the test.
+        file: where tests are kept one by one; those that are there are not repeated.
+        step: called before each test with its number and what it is.
+        checkpoints: folder of checkpoint files; the shipped ones if None.
+    """
+    arm, path = method(name), _path(name, checkpoints)
+    mark = _fingerprint(name, test, checkpoints)
+    earlier = store.read_json(file) if file.is_file() else {}
+    ready = earlier.get("tests", []) if earlier.get("fingerprint") == mark else []
+    seeds = contents(name, path)[1]["seeds"] if arm.trained else []
+    tests: list[dict[str, Any]] = []
+    for count, key in enumerate(plan(name, test, checkpoints)):
         if step is not None:
-            step(count, f"episode {mark}, {shift}, {1000 * h:g} ms")
-        policy = load(name, mark, path=path)
-        seeds = max(1, len(answer["seeds"]))
-        side = h != study.task.h or (name not in FULL and arm.trained)
-        number = min(test.trajectories, SIDE) if side else test.trajectories
-        task = shifted(task_of(name, study), shift, h)
-        # fixed gains have no axis of seeds; a leading axis of one does not disturb them
-        asked = None if arm.capped and shift != "nominal" else predict  # nothing to predict there
-        found = run_test(policy, task, replace(test, trajectories=number), seeds, predict=asked)
-        key = {"episode": mark, "shift": shift, "h": h, "trajectories": number}
-        answer["tests"].append(key | found)
-    answer["certificates"] = certificates(name, path) if arm.contracting else []
-    return answer
+            step(count, f"{name}, episode {key['episode']}, {key['shift']}, {1000 * key['h']:g} ms")
+        found = next((t for t in ready if all(t[k] == key[k] for k in KEYS)), None)
+        if found is None:
+            number = replace(test, trajectories=key["trajectories"])
+            task = shifted(task_of(name), key["shift"], key["h"])
+            policy = load(name, key["episode"], path=path)
+            # fixed gains have no axis of seeds; a leading axis of one does not disturb them
+            made = run_test(policy, task, number, max(1, len(seeds)), predict=_predict(name, key))
+            found = key | made
+        tests.append(found)
+        later = [t for t in ready if all(t is not kept for kept in tests)]
+        store.write_json(file, {"fingerprint": mark, "tests": tests + later})
+    certified = certificates(name, path) if arm.contracting else []
+    training = _training(name, path) if arm.trained else {}
+    kept = {"tests": tests, "certificates": certified}
+    return {"title": arm.title, "seeds": seeds, "training": training, **kept}
+
+
+def _predict(name: str, key: dict[str, Any]) -> str | None:
+    """How the oscillation of a test is predicted, if it is."""
+    arm = method(name)
+    if arm.interface == "raw" or (arm.capped and key["shift"] != "nominal"):
+        return None  # no slopes in the signals; nothing to predict below a cap
+    return "weights" if arm.contracting and name != "cppo_no_integral" else "visited"
+
+
+def _training(name: str, path: Path | None) -> dict[str, Any]:
+    """Learning curve, averaged over 240 episodes."""
+    episodes, returns = learning_curve(name, path)
+    size = min(240 // PegTouchStudy().episodes_per_update, len(returns))
+    count = len(returns) // size
+    smooth = returns[: count * size].reshape(count, size, -1).mean(axis=1)
+    episode = episodes[size - 1 :: size][:count]
+    return {"episode": episode.tolist(), "return": np.round(smooth, 3).tolist()}
 
 
 def results() -> dict[str, Any]:
@@ -203,4 +222,5 @@ def _fingerprint(name: str, test: TestConfig, checkpoints: Folder) -> str:
     """Changes with the checkpoint and with the test, so that old answers are not taken for new."""
     path = _path(name, checkpoints) or (checkpoint_path(name) if method(name).trained else None)
     data = path.read_bytes() if path is not None and path.is_file() else b""
-    return hashlib.sha256(data + repr((test, plan(name, checkpoints))).encode()).hexdigest()[:16]
+    length = (test.duration, test.seed, test.detectors, test.sign_every)
+    return hashlib.sha256(data + repr(length).encode()).hexdigest()[:16]
