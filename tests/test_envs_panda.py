@@ -159,7 +159,7 @@ def test_latent_signal_and_integral_are_what_they_are_called(name):
             obs = task.set_subgoal(high)
             previous = np.zeros((4, 6))
         field = {n: obs[:, part] for n, part in task.layout.items()}
-        y = latent.K1 * field["error"] - latent.K2 * task.worlds.velocity
+        y = latent.K1 * field["error"] - latent.K2 * task.worlds.signals[:, 6:]
         np.testing.assert_allclose(field["latent"], y, atol=1e-12)
         previous = previous + 0.02 * y * [1, 1, 1, 0, 0, 0]
         np.testing.assert_allclose(field["integral"], previous, atol=1e-12)

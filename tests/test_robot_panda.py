@@ -166,7 +166,8 @@ def test_motors_clip_at_the_torque_limit(scene):
 def test_only_the_peg_collides(scene):
     model, _ = scene
     colliding = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
-    assert [model.geom(int(i)).name for i in colliding] == ["peg"]
+    assert {model.geom(int(i)).name for i in colliding} == {"peg", "wrist"}  # wrist: a hood only
+    assert model.geom("wrist").conaffinity == 2
     np.testing.assert_allclose(model.geom_size[model.geom("peg").id][0], PEG_RADIUS)
 
 

@@ -6,7 +6,9 @@ A tick lasts 20 ms. The low level acts at every tick; the high level sets a sub-
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -63,10 +65,12 @@ class PandaTask:
         )
         self.seed(seed)
         latent = config.gains.latent
-        self._K1, self._K2 = latent.K1, latent.K2
+        # mapping_pos: y = K1 e + K2 e', with e' = -velocity because a sub-goal is at rest
+        self._to_latent = np.vstack([np.diag(latent.K1), -np.diag(latent.K2)])
         self._sum = np.repeat([config.tick, 0.0], 3)  # the integral acts on translation only
         self._u_high = np.array(config.u_limit)
         self._u_low = -self._u_high
+        self._action = np.zeros((num, config.low_size))
         self._high_low, self._high_high = (
             np.array(config.subgoal_low),
             np.array(config.subgoal_high),
@@ -77,15 +81,18 @@ class PandaTask:
         if config.command == "joint":
             self._space_low = np.maximum(self._q_start + self._space_low, LOWER)
             self._space_high = np.minimum(self._q_start + self._space_high, UPPER)
-        self.target, self._target_quat = np.zeros((num, 3)), np.zeros((num, 4))
+        self._aims = np.zeros((2, num, 3))
+        self._goal, self.target = self._aims
+        self._target_quat = np.zeros((num, 4))
         self.target_rotation, self.target_joints = np.zeros((num, 3)), np.zeros((num, JOINTS))
-        self._integral, self._goal = np.zeros((num, 6)), np.zeros((num, 3))
         self._ticks = np.zeros(num, dtype=int)
         self.layout, self.observation_size = _slices({**self._fields(), "time_to_go": 1})
         self.high_level = (*HIGH_LEVEL, *self._own_fields())
         self._obs = np.zeros((num, self.observation_size))
         self._views = {name: self._obs[:, part] for name, part in self.layout.items()}
+        # These live in the observation itself.
         self._left = self._views["time_to_go"][:, 0]
+        self._integral = self._views.get("integral", np.zeros((num, 6)))
         self._everyone, self._nobody = np.ones(num, dtype=bool), np.zeros(num, dtype=bool)
         self._vectors = np.zeros((5, num, 3))
         pose = config.command == "pose"
@@ -196,46 +203,45 @@ class PandaTask:
             (N), `penetration` (m, deepest of the tick), `success`.
         """
         action = checked(u, (self.num, self.config.low_size), "low-level action")
-        action = np.maximum(action, self._u_low)
+        action = np.maximum(action, self._u_low, out=self._action)
         np.minimum(action, self._u_high, out=action)
         worlds = self.worlds
         if self.config.command == "pose":
-            worlds.tick_pose(self.target, self._target_quat, action, self._views["error"])
+            worlds.tick_pose(self.target, self._target_quat, action)
         else:
             # The low-level action may only add to the pull towards the sub-goal (appendix G).
             pull = np.sign(self.target_joints - worlds.qpos[:, :JOINTS])
             worlds.tick_joint(self.target_joints, self.config.joint_stiffness, abs(action) * pull)
         self._ticks += 1
         self._left -= self.config.tick
-        np.maximum(self._left, 0.0, out=self._left)
         obs = self._observe(None)
         lengths = self._lengths()
-        distance, tilt, tracking, peaks = lengths[0], lengths[1], -lengths[3:], worlds.peaks.copy()
-        terms = self._rewards(distance, tilt)
+        distance, peaks, tracking = lengths[0], worlds.peaks.copy(), -lengths[1::3]
+        terms = self._rewards(distance, lengths[2])
         info = {
             "reward_terms": terms,
-            "tracking_terms": dict(zip(self._tracked, tracking, strict=True)),
-            "contact_force": lengths[2],
+            "tracking_terms": dict(zip(self._tracked, tracking, strict=False)),
+            "contact_force": lengths[3],
             "contact_force_max": peaks[0],
             "penetration": peaks[1],
             "success": self._success(distance),
         }
-        total: Array = np.add.reduce(list(terms.values()))
+        total: Array = functools.reduce(operator.add, terms.values())
         return obs, total, self._nobody.copy(), self._ticks >= self.config.ticks, info
 
     def _lengths(self) -> Array:
-        """Distance to the goal, tilt, contact force and what is left to the sub-goal, (4+, N)."""
+        """Distances to goal and sub-goal, tilt, contact force, rotation error, (5, N)."""
         vectors, views, worlds = self._vectors, self._views, self.worlds
-        np.subtract(self._goal, worlds.tip, out=vectors[0])
-        vectors[1] = views["rotation"]
-        vectors[2] = worlds.force
+        np.subtract(self._aims, worlds.tip, out=vectors[:2])
+        vectors[2], vectors[3] = views["rotation"], worlds.force
         if self.config.command == "pose":
-            np.subtract(self.target, worlds.tip, out=vectors[3])
-            vectors[4] = views["error"][:, 3:]
+            vectors[4] = worlds.signals[:, 3:6]
             return np.sqrt(np.vecdot(vectors, vectors))
+        vectors[4] = 0.0
         joints = views["joint_error"]
-        short = np.sqrt(np.vecdot(vectors[:3], vectors[:3]))
-        return np.concatenate([short, np.sqrt(np.vecdot(joints, joints))[None]])
+        lengths = np.sqrt(np.vecdot(vectors, vectors))
+        lengths[1] = np.sqrt(np.vecdot(joints, joints))
+        return lengths
 
     # -- observations --------------------------------------------------------------------------
 
@@ -251,21 +257,20 @@ class PandaTask:
         views["position"][:] = worlds.tip
         views["rotation"][:] = worlds.rotation()
         views["velocity"][:] = worlds.tip_velocity
-        views["goal"][:] = self._goal
         if self.config.command == "joint":
             views["joints"][:] = worlds.qpos[:, :JOINTS]
             views["joint_velocity"][:] = worlds.qvel[:, :JOINTS]
-            views["joint_error"][:] = self.target_joints - views["joints"]
+            np.subtract(self.target_joints, views["joints"], out=views["joint_error"])
         else:
-            error, latent = worlds.error(self.target, self._target_quat), views["latent"]
-            views["error"][:] = error
-            np.multiply(self._K1, error, out=latent)
-            latent -= self._K2 * worlds.velocity  # mapping_pos; the sub-goal is at rest
+            worlds.aim(self.target, self._target_quat)
+            views["error"][:] = worlds.signals[:, :6]
+            latent = np.matmul(worlds.signals, self._to_latent, out=views["latent"])
             if fresh is None:
                 self._integral += self._sum * latent  # I_k = I_{k-1} + h y_k
             else:
                 self._integral[fresh] = self._sum * latent[fresh]
-            views["integral"][:] = self._integral
+        if fresh is not None:
+            views["goal"][:] = self._goal
         self._observe_own(views)
         return self._obs.copy()
 

@@ -104,7 +104,7 @@ class PegMazeEnv(PandaEnv):
     | 15-20 | error       | e, of the hand's nominal tip, limited in the soft regime    | m, rad     |
     | 21-26 | latent      | y = K1 e + K2 e'                                            | m/s^2, ... |
     | 27-32 | integral    | of y since the sub-goal was set; 0 for rotation             | m/s, ...   |
-    | 33    | time_to_go  | until the next sub-goal is due                              | s          |
+    | 33    | time_to_go  | until the next sub-goal is due; negative when overdue       | s          |
 
     `env.task.layout` holds the slices, `HIGH_LEVEL`, `ACTOR` and `CRITIC` name what each level
     reads. Regime "joint" has joints (7, rad), joint_velocity (7, rad/s) and joint_error (7, rad)

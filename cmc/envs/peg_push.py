@@ -96,7 +96,7 @@ class PegPushEnv(PandaEnv):
     | 21-26 | error           | e = sub-goal - tip                                | m, rad     |
     | 27-32 | latent          | y = K1 e + K2 e'                                  | m/s^2, ... |
     | 33-38 | integral        | of y since the sub-goal was set; 0 for rotation   | m/s, ...   |
-    | 39    | time_to_go      | until the next sub-goal is due                    | s          |
+    | 39    | time_to_go      | until the next sub-goal is due; < 0 when overdue  | s          |
 
     `env.task.layout` holds the slices; `HIGH_LEVEL`, `ACTOR` and `CRITIC` name what each level
     reads (`env.task.high_level` adds the sliders).

@@ -33,7 +33,8 @@ class Worlds(Protocol):
         num: N.
         qpos: joint positions (N, nq), qvel: joint velocities (N, nv): live views.
         tip: true tip (N, 3), m. nominal: tip fixed to the hand (N, 3), m.
-        velocity: of the nominal tip (N, 6); tip_velocity: of the true tip (N, 6); m/s and rad/s.
+        signals: control error towards the target last aimed at, and velocity of the nominal tip,
+            (N, 12), m, rad, m/s, rad/s. tip_velocity: of the true tip (N, 6).
         force: net contact force on the peg at the end of the tick (N, 3), N.
         peaks: over the physics steps of the tick, the largest norm of the force in N and the
             deepest penetration in m, at least 0, (2, N).
@@ -45,7 +46,7 @@ class Worlds(Protocol):
     qvel: Array
     tip: Array
     nominal: Array
-    velocity: Array
+    signals: Array
     tip_velocity: Array
     force: Array
     peaks: Array
@@ -53,16 +54,16 @@ class Worlds(Protocol):
     def reset(self, qpos: Array, mask: NDArray[np.bool_]) -> None:
         """Put the masked worlds at rest at `qpos` (N, nq)."""
 
-    def error(self, position: Array, quat: Array) -> Array:
-        """Control error (N, 6) towards target poses (N, 3), (N, 4)."""
+    def aim(self, position: Array, quat: Array) -> None:
+        """Compute the control error towards target poses (N, 3), (N, 4) for the current state."""
 
     def rotation(self) -> Array:
         """Orientation of the hand as a rotation vector from pointing straight down, (N, 3)."""
 
-    def tick_pose(self, position: Array, quat: Array, u: Array, error: Array) -> None:
+    def tick_pose(self, position: Array, quat: Array, u: Array) -> None:
         """One tick of task-space control with low-level action `u` (N, 6).
 
-        `error` is what `error(position, quat)` returns for the current state.
+        The worlds must have been aimed at the same target in the current state.
         """
 
     def tick_joint(self, target: Array, stiffness: float, u: Array) -> None:
@@ -85,17 +86,15 @@ class OneWorld:
         self.data = mujoco.MjData(model)
         self.controller = TaskSpaceController(model, gains, law)
         self.qpos, self.qvel = self.data.qpos[None], self.data.qvel[None]
-        self.nominal, self.velocity = (
-            self.controller.position[None],
-            self.controller.velocity[None],
-        )
+        self.nominal, self.signals = self.controller.position[None], self.controller.signals[None]
         self._compliant = _is_compliant(model)
         self._tip_id = model.site("tip").id
         self._tip = self.data.site_xpos[self._tip_id]
         self.tip = self._tip[None] if self._compliant else self.nominal
-        self.tip_velocity = np.zeros((1, 6)) if self._compliant else self.velocity
+        self.tip_velocity = np.zeros((1, 6)) if self._compliant else self.signals[:, 6:]
         self._slide = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "hand")
         self._forces, self._distances = _history(model, substeps, self.data.history)
+        self._every_force = self._forces.reshape(-1)
         self._last_force = self.data.sensordata[:3]
         self.force, self.peaks = np.zeros((1, 3)), np.zeros((2, 1))
         self._down, self._vector = np.zeros(4), np.zeros(3)
@@ -110,9 +109,9 @@ class OneWorld:
         self.force[:], self.peaks[:] = 0.0, 0.0
         self._observe()
 
-    def error(self, position: Array, quat: Array) -> Array:
-        """See `Worlds.error`."""
-        return self.controller.error(position[0], quat[0])[None]
+    def aim(self, position: Array, quat: Array) -> None:
+        """See `Worlds.aim`."""
+        self.controller.aim(position[0], quat[0])
 
     def rotation(self) -> Array:
         """See `Worlds.rotation`."""
@@ -120,12 +119,12 @@ class OneWorld:
         mujoco.mju_quat2Vel(self._vector, self._down, 1.0)
         return self._vector[None]
 
-    def tick_pose(self, position: Array, quat: Array, u: Array, error: Array) -> None:
+    def tick_pose(self, position: Array, quat: Array, u: Array) -> None:
         """See `Worlds.tick_pose`."""
         data, controller = self.data, self.controller
         goal, turn, action = position[0], quat[0], u[0]
         if self.hold:
-            self._step_held(controller.torque_from(data, error[0], action))
+            self._step_held(controller.torque_aimed(data, action))
         else:
             self._step_each(lambda: controller.torque(data, goal, turn, action))
 
@@ -159,11 +158,13 @@ class OneWorld:
 
     def _finish(self) -> None:
         mujoco.mj_step1(self.model, self.data)
-        squares = np.vecdot(self._forces, self._forces)
-        largest = float(squares.max())
         self.force[0] = self._last_force
-        self.peaks[0] = largest**0.5
-        self.peaks[1] = max(0.0, -float(self._distances.min())) if largest > 0 else 0.0
+        if self._every_force.dot(self._every_force) > 0.0:
+            squares = np.vecdot(self._forces, self._forces)
+            self.peaks[0] = float(squares.max()) ** 0.5
+            self.peaks[1] = max(0.0, -float(self._distances.min()))
+        else:
+            self.peaks.fill(0.0)
         self._observe()
 
     def _observe(self) -> None:
@@ -224,21 +225,24 @@ class ManyWorlds:
         self.force[ids], self.peaks[:, ids] = 0.0, 0.0
         self._observe()
 
-    def error(self, position: Array, quat: Array) -> Array:
-        """See `Worlds.error`."""
-        return self.controller.error(position, quat)
+    def aim(self, position: Array, quat: Array) -> None:
+        """See `Worlds.aim`."""
+        self.controller.aim(position, quat)
 
     def rotation(self) -> Array:
         """See `Worlds.rotation`."""
         return rotation_vector(quat_multiply(self._hand_quat, _UP))
 
-    def tick_pose(self, position: Array, quat: Array, u: Array, error: Array) -> None:
+    def tick_pose(self, position: Array, quat: Array, u: Array) -> None:
         """See `Worlds.tick_pose`."""
         controller = self.controller
-        if self.hold:
-            self._tick(lambda: controller.torque_from(error, u))
-        else:
-            self._tick(lambda: controller.torque_from(controller.error(position, quat), u))
+
+        def torque() -> Array:
+            if not self.hold:
+                controller.aim(position, quat)
+            return controller.torque_aimed(u)
+
+        self._tick(torque)
 
     def tick_joint(self, target: Array, stiffness: float, u: Array) -> None:
         """See `Worlds.tick_joint`."""
@@ -261,11 +265,11 @@ class ManyWorlds:
 
     def _observe(self) -> None:
         self.controller.observe()
-        self.nominal, self.velocity = self.controller.position, self.controller.velocity
-        self.tip, self.tip_velocity = self.nominal, self.velocity
+        self.nominal, self.signals = self.controller.position, self.controller.signals
+        self.tip, self.tip_velocity = self.nominal, self.signals[:, 6:]
         if self._compliant:
             axes = self._hand_mat.reshape(-1, 3, 3)[:, :, :2]
-            self.tip, self.tip_velocity = self._tip.copy(), self.velocity.copy()
+            self.tip, self.tip_velocity = self._tip.copy(), self.tip_velocity.copy()
             slide = self.qvel[:, JOINTS : JOINTS + 2, None]
             self.tip_velocity[:, :3] += (axes @ slide)[..., 0]
 

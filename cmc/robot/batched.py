@@ -55,6 +55,7 @@ class BatchedController:
     Attributes:
         position: of the site when last observed, (N, 3), m.
         velocity: linear and angular, (N, 6), m/s and rad/s.
+        signals: the error last aimed at, then the velocity, (N, 12).
         jac: Jacobian of the site for the seven joints, (N, 6, 7).
     """
 
@@ -67,7 +68,6 @@ class BatchedController:
         site: str = "tip_nominal",
     ) -> None:
         self.gains, self.law = gains, law or ControlLaw()
-        self._kp, self._kd = gains.kp, gains.kd
         self._posture = np.array(self.law.posture)
         site_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, site)
         if site_id < 0:
@@ -82,7 +82,9 @@ class BatchedController:
         self._inertia = batch.bind("M")
         self._gather, self._absent = _dense_index(model)
         self.position = np.zeros((batch.nsim, 3))
-        self.velocity = np.zeros((batch.nsim, 6))
+        self.signals = np.zeros((batch.nsim, 12))
+        self._error, self.velocity = self.signals[:, :6], self.signals[:, 6:]
+        self._gain = np.vstack([np.diag(gains.kp), -np.diag(gains.kd)])
         self.jac = np.zeros((batch.nsim, 6, JOINTS))
 
     def observe(self) -> None:
@@ -91,11 +93,15 @@ class BatchedController:
         self.jac[:, 3:] = self._axis.swapaxes(1, 2)
         arm = self.position[:, None] - self._anchor
         self.jac[:, :3] = cross(self._axis, arm).swapaxes(1, 2)
-        self.velocity = (self.jac @ self._qvel[..., None])[..., 0]
+        self.velocity[:] = (self.jac @ self._qvel[..., None])[..., 0]
 
     def error(self, position: Array, quat: Array) -> Array:
         """Pose error (N, 6) of the states last observed: limited translation, log-map rotation."""
-        error = np.empty((len(self.position), 6))
+        return self.aim(position, quat).copy()
+
+    def aim(self, position: Array, quat: Array) -> Array:
+        """As `error`, into `signals`, for the torque that follows."""
+        error = self._error
         np.subtract(position, self.position, out=error[:, :3])
         conjugate = self._site_quat * np.array([1.0, -1.0, -1.0, -1.0])
         error[:, 3:] = rotation_vector(quat_multiply(quat, conjugate))
@@ -107,7 +113,12 @@ class BatchedController:
 
     def torque_from(self, error: Array, u: Array) -> Array:
         """Joint torques (N, 7) for errors (N, 6) of the states last observed."""
-        return self.torque_for(self._kp * error - self._kd * self.velocity + u)  # 2nd_sys
+        self._error[:] = error
+        return self.torque_aimed(u)
+
+    def torque_aimed(self, u: Array) -> Array:
+        """Joint torques (N, 7) for the states last observed and the targets last aimed at."""
+        return self.torque_for(self.signals @ self._gain + u)  # 2nd_sys
 
     def torque_for(self, reference: Array) -> Array:
         """Joint torques (N, 7) that realise tip accelerations (N, 6)."""

@@ -127,6 +127,7 @@ class TaskSpaceController:
     Attributes:
         position: of the site when last observed, (3,), m.
         velocity: linear and angular, (6,), m/s and rad/s.
+        signals: the error last aimed at, then the velocity, (12,).
         jac: Jacobian of the site for the seven joints, (6, 7).
     """
 
@@ -142,7 +143,6 @@ class TaskSpaceController:
         if self.site < 0:
             raise ValueError(f"the scene has no site {site!r}")
         self._body = int(model.site_bodyid[self.site])
-        self._kp, self._kd = gains.kp, gains.kd
         self._posture = np.array(self.law.posture)
         nv = model.nv
         self._full, self._jacdot, self._solved = (np.zeros((6, nv)) for _ in range(3))
@@ -155,10 +155,13 @@ class TaskSpaceController:
         self._inverse, self._scratch = np.zeros((6, 6)), np.zeros(JOINTS)
         self._block_trans, self._block_rot = np.zeros((3, 3)), np.zeros((3, 3))
         self._force = np.zeros(6)
-        self._local, self._error = np.zeros(3), np.zeros(6)
-        self._etrans, self._erot = self._error[:3], self._error[3:]
+        self._local = np.zeros(3)
+        self.signals = np.zeros(12)
+        self._error, self.velocity = self.signals[:6], self.signals[6:]
+        self._etrans, self._erot = self.signals[:3], self.signals[3:6]
+        self._gain = np.hstack([np.diag(gains.kp), -np.diag(gains.kd)])
         self._solution = {3: np.zeros(3), 6: np.zeros(6)}
-        self.position, self.velocity, self.quat = np.zeros(3), np.zeros(6), np.zeros(4)
+        self.position, self.quat = np.zeros(3), np.zeros(4)
         self._data: mujoco.MjData | None = None
 
     def _bind(self, data: mujoco.MjData) -> None:
@@ -184,6 +187,10 @@ class TaskSpaceController:
 
         The rotation is the log map; the translation is shortened to the law's error limit.
         """
+        return self.aim(position, quat).copy()
+
+    def aim(self, position: Array, quat: Array) -> Array:
+        """As `error`, into `signals`, for the torque that follows."""
         trans = self._etrans
         np.subtract(position, self.position, out=trans)
         mujoco.mju_subQuat(self._local, quat, self.quat)  # log map, in the frame of the site
@@ -193,7 +200,7 @@ class TaskSpaceController:
             length = float(trans.dot(trans)) ** 0.5
             if length > limit:
                 trans *= limit / length
-        return self._error.copy()
+        return self._error
 
     def torque(self, data: mujoco.MjData, position: Array, quat: Array, u: Array) -> Array:
         """Joint torques (7,), N m, before the motors' limits.
@@ -205,12 +212,17 @@ class TaskSpaceController:
             u: low-level action, (6,), m/s^2 and rad/s^2; positive u moves the tip towards +x.
         """
         self.observe(data)
-        return self.torque_from(data, self.error(position, quat), u)
+        self.aim(position, quat)
+        return self.torque_aimed(data, u)
 
     def torque_from(self, data: mujoco.MjData, error: Array, u: Array) -> Array:
         """Joint torques (7,) for an error (6,) of the state last observed."""
-        reference = self._kp * error
-        reference -= self._kd * self.velocity
+        self._error[:] = error
+        return self.torque_aimed(data, u)
+
+    def torque_aimed(self, data: mujoco.MjData, u: Array) -> Array:
+        """Joint torques (7,) for the state last observed and the target last aimed at."""
+        reference = self._gain.dot(self.signals)
         reference += u  # 2nd_sys
         return self.torque_for(data, reference)
 
@@ -241,8 +253,9 @@ class TaskSpaceController:
                 trans, rot, force = self._block_trans, self._block_rot, self._force
                 trans[:], rot[:] = inverse[:3, :3], inverse[3:, 3:]
                 undo = self._solve(inverse, disturbed)
-                np.subtract(self._solve(trans, reference[:3]), undo[:3], out=force[:3])
-                np.subtract(self._solve(rot, reference[3:]), undo[3:], out=force[3:])
+                force[:3] = self._solve(trans, reference[:3])
+                force[3:] = self._solve(rot, reference[3:])
+                force -= undo
             else:
                 force = self._solve(inverse, reference - disturbed)
             tau += force.dot(jac)  # Nakanishi 3.3

@@ -1,0 +1,112 @@
+"""Panda environments: a whole tick against raw physics of the same scene, in the same run.
+
+A tick is controller, ten 2 ms physics steps, observation, rewards and contact logging; the
+reference is `mj_step(model, data, 10)` with a constant torque. One core, CPU time, best of several
+repeats that take turns. `share` rows give raw speed reached by control at every physics step.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+
+from cmc.envs.panda_task import PandaTask
+from cmc.envs.peg_maze import JOINT, SOFT, STIFF, PegMaze, PegMazeEnv
+from cmc.envs.peg_push import PUSH, PegPush, PegPushEnv
+from cmc.robot.panda import LOWER, UPPER
+
+CASES = {"maze": (PegMaze, STIFF), "maze_soft": (PegMaze, SOFT), "push": (PegPush, PUSH)}
+REPEATS = 15
+
+
+def run() -> Iterator[dict[str, str | float]]:
+    """Rows: ratio to raw physics per tick (below 1 for `share` rows: raw speed reached)."""
+    for name, (task, config) in CASES.items():
+        every = replace(config, hold=False)
+        calls = {
+            "raw": (_raw(task(config)), 1),
+            "one": (_ticks(task(config, 1)), 1),
+            "gym": (_gym(name), 1),
+            "many": (_ticks(task(config, 32)), 32),
+            "every": (_ticks(task(every, 1)), 1),
+            "every_many": (_ticks(task(every, 32)), 32),
+        }
+        best = _best({key: call for key, (call, _) in calls.items()})
+        cost = {key: best[key] / worlds for key, (_, worlds) in calls.items()}
+        raw = cost["raw"]
+        yield {"name": f"{name}: one world", "ratio": cost["one"] / raw, "us": 1e6 * cost["one"]}
+        yield {"name": f"{name}: through gymnasium", "ratio": cost["gym"] / raw}
+        yield {"name": f"{name}: 32 worlds, each", "ratio": cost["many"] / raw}
+        yield {"name": f"{name}: 32 worlds against one", "ratio": cost["many"] / cost["one"]}
+        yield {"name": f"{name}: control at every step, share", "ratio": raw / cost["every"]}
+        yield {"name": f"{name}: same, 32 worlds, share", "ratio": raw / cost["every_many"]}
+    for name, (task, config) in {**CASES, "maze_joint": (PegMaze, JOINT)}.items():
+        yield {"name": f"{name}: 10^5 random ticks", **_drive(task(config, 32, seed=0))}
+
+
+def _raw(task: PandaTask) -> Callable[[], object]:
+    model, data = task.worlds.model, mujoco.MjData(task.worlds.model)
+    data.qpos[:] = task.worlds.qpos[0]
+    mujoco.mj_forward(model, data)
+    data.ctrl[:] = data.qfrc_bias[:7]
+    return lambda: mujoco.mj_step(model, data, 10)
+
+
+def _ticks(task: PandaTask) -> Callable[[], object]:
+    u = np.zeros((task.num, task.config.low_size))
+    return lambda: task.step(u)
+
+
+def _gym(name: str) -> Callable[[], object]:
+    if name == "push":
+        env: PegPushEnv | PegMazeEnv = PegPushEnv(action_mode="low")
+    else:
+        env = PegMazeEnv("soft" if name == "maze_soft" else "stiff", action_mode="low")
+    env.reset(seed=0)
+    u = np.zeros(env.action_space.shape or (), dtype=np.float32)
+    return lambda: env.step(u)
+
+
+def _best(calls: dict[str, Callable[[], object]]) -> dict[str, float]:
+    """CPU seconds per call, best of the repeats."""
+    best = dict.fromkeys(calls, np.inf)
+    counts = {key: 10 if "many" in key else 100 for key in calls}
+    for _ in range(REPEATS):
+        for key, call in calls.items():
+            start = time.process_time()
+            for _ in range(counts[key]):
+                call()
+            best[key] = min(best[key], (time.process_time() - start) / counts[key])
+    return best
+
+
+def _drive(task: PandaTask) -> dict[str, float]:
+    """10^5 ticks under random sub-goals and actions: nothing may blow up."""
+    c, rng = task.config, np.random.default_rng(0)
+    limit, margin, away, soft = np.array(c.u_limit), np.inf, 0.0, []
+    ticks = 100_000 // task.num
+    start = time.process_time()
+    for k in range(ticks):
+        if task.due.any():
+            task.set_subgoal(rng.uniform(c.subgoal_low, c.subgoal_high, (task.num, c.high_size)))
+        obs, _, _, truncated, info = task.step(rng.uniform(-1, 1, (task.num, c.low_size)) * limit)
+        if not np.isfinite(obs).all():
+            raise RuntimeError(f"tick {k}: an observation is not finite")
+        q = task.worlds.qpos[:, :7]
+        margin = min(margin, float(np.minimum(q - LOWER, UPPER - q).min()))
+        away = max(away, float(np.linalg.norm(task.worlds.tip - c.start, axis=-1).max()))
+        soft.append(info["contact_force_max"] < 1.0)
+        if truncated.any():
+            task.reset(truncated)
+    seconds = time.process_time() - start
+    raw = _best({"raw": _raw(task)})["raw"]
+    return {
+        "ratio": seconds / (ticks * task.num) / raw,
+        "joint_margin_rad": margin,
+        "farthest_tip_m": away,
+        "share_below_1N": float(np.mean(soft)),
+    }
