@@ -26,7 +26,7 @@ def _cpu(task: Callable[[], object], repeats: int = 5) -> float:
 
 
 def run() -> Iterator[dict]:
-    model = load_scene("panda.xml")
+    model = load_scene("peg_maze.xml")
     data = mujoco.MjData(model)
     qpos = data.qpos + 0.1 * np.sin(np.linspace(0, 20, FRAMES))[:, None] * np.ones(model.nq)
     times = 0.02 * np.arange(FRAMES)

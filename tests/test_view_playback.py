@@ -335,6 +335,15 @@ def test_fixed_cameras_and_goal_zones_of_the_model_are_taken_over():
     assert place[12:15] == [1, 2, 3]
 
 
+def test_live_is_one_argument_away(recording, monkeypatch):
+    shown = []
+    monkeypatch.setattr(notebook, "display", shown.append)
+    with recording.show("playback/unused.html", live=True) as live:
+        assert f'src="{live.url}"' in shown[0]._repr_html_()
+        assert live.url.startswith("http://127.0.0.1:")
+    assert live.closed
+
+
 def test_own_cameras_replace_the_presets(model):
     qpos, _, times = tumble(model, frames=2)
     mine = {"mine": Camera((1, 0, 0), (0, 0, 0))}

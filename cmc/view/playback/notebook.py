@@ -18,6 +18,7 @@ from IPython.display import IFrame, display
 from cmc.view.playback.page import scene_id
 
 if TYPE_CHECKING:
+    from cmc.view.playback.live import LiveView
     from cmc.view.playback.recorder import Recording
 
 # Every frame of the page gets the message; only the one with the same scene heeds it.
@@ -95,3 +96,14 @@ def show(
     display(IFrame(path.as_posix(), width="100%", height=height))
     chosen = time_slider(recording) if slider is None else slider
     return ipywidgets.VBox([chosen, link(recording, chosen)])
+
+
+def show_live(recording: Recording, *, height: int = 480) -> LiveView:
+    """Serve the scene on the loopback interface and show it in a frame.
+
+    Only a browser on the same machine reaches it. Keep the returned view, `update` it, and `close`
+    it; otherwise it closes itself after its timeout.
+    """
+    view = recording.serve()
+    display(IFrame(view.url, width="100%", height=height))
+    return view

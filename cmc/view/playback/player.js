@@ -13,6 +13,9 @@ try {
   return;
 }
 const THREE = MeshCat.THREE;
+const resize = viewer.set_3d_pane_size.bind(viewer);
+viewer.set_3d_pane_size = (width, height) => resize(  // the bar below must not hide the scene
+  width, height === undefined ? window.innerHeight - byId("bar").offsetHeight : height);
 
 function unpack(text, Type) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));

@@ -77,11 +77,18 @@ class Recording:
         text = self.html().encode()
         return write_atomic(path, lambda file: file.write(text))
 
-    def show(self, path: str | Path, height: int = 480, slider: Any = None) -> Any:
-        """Save to `path` and show the file in a notebook; see `notebook.show`."""
-        from cmc.view.playback.notebook import show
+    def show(
+        self, path: str | Path, height: int = 480, slider: Any = None, live: bool = False
+    ) -> Any:
+        """Save to `path` and show the file in a notebook, or, `live`, a page served from here.
 
-        return show(self, path, height=height, slider=slider)
+        Returns the slider under the scene, or the `LiveView`; see `notebook.show` and `show_live`.
+        """
+        from cmc.view.playback import notebook
+
+        if live:
+            return notebook.show_live(self, height=height)
+        return notebook.show(self, path, height=height, slider=slider)
 
     def serve(self, timeout: float = 600.0) -> LiveView:
         """Serve the scene live on the loopback interface instead; see `live.LiveView`."""
