@@ -16,6 +16,7 @@ _SUBMODULES = (
     "exercises",
     "fast",
     "learning",
+    "lessons",
     "notation",
     "plants",
     "policies",

@@ -58,7 +58,7 @@ def certify(
             rule, ([seeds,] n, 2). Exact certificates of plants with varying Jacobians evaluate it:
             `pi(s)` on numpy arrays (..., n, 2), or a torch module `network`.
         plant: Has `n`, `f`, `f_y`, `f_u`, `hold`, bounds `y_low`, `y_high`, and `constant`.
-        region: Box that is looked at; the plant's own bounds by default.
+        region: Box that is looked at, on its grid; the plant's own bounds by default.
         h: Sample time of a zero-order hold, s; continuous control without it.
         kind: "exact", "frozen", or None for exact where the plant's Jacobians are constant and
             frozen elsewhere.
@@ -81,14 +81,14 @@ def certify(
     constant = plant.constant and not callable(transforms)
     kind = kind or ("exact" if constant else "frozen")
     domain: Domain = "continuous" if h is None else "sampled"
-    where = "everywhere" if constant else str(region)
     points = region.grid()
+    looked = "everywhere" if constant else f"{region}, at {points[..., 0].size} grid points"
     if constant:
         points = points[(0,) * plant.n][None]
     try:
         space = spaces(points)
     except (ValueError, np.linalg.LinAlgError) as error:
-        return Certificate(False, kind, domain, region=where, reason=str(error), refused=True)
+        return Certificate(False, kind, domain, region=looked, reason=str(error), refused=True)
     if kind == "exact" and not constant:
         return certify_exact(policy, plant, spaces, region, h=h, y_ref=y_ref)
     if getattr(policy, "normalise", False):
@@ -99,7 +99,7 @@ def certify(
         answer = _by_dimension(space, lower, upper, h, kind)
     else:
         answer = _all_at_once(space, lower, upper, h, kind)
-    return replace(answer, region=where)
+    return replace(answer, region=looked)
 
 
 def _slopes(policy: Any, n: int) -> tuple[Array, Array]:
