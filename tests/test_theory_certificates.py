@@ -525,3 +525,15 @@ def test_random_plants_of_three_dimensions_keep_their_promise(h):
         loops = np.concatenate([top, below], axis=-2)
         assert rate_in(loops, answer.metric, h) >= answer.rate - 1e-7
     assert held >= 3
+
+
+def test_a_certificate_says_whether_it_is_a_proof_or_looked_at_points():
+    from cmc.policies import PositiveNetwork
+
+    policy = PositiveNetwork(2, slope_min=0.5, slope_max=2.0)
+    proof = certify(policy, plants.get("coupled_lags"))
+    points = certify(policy, plants.get("pendulum"), kind="frozen")
+    assert proof.evidence == "proof"
+    assert str(proof).startswith("contracting (exact")
+    assert points.evidence == "points"
+    assert "grid points" in points.region

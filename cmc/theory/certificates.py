@@ -25,6 +25,7 @@ from cmc.theory.metric_search import MetricSearch, condition_metric, search_metr
 Array = NDArray[np.float64]
 Kind = Literal["frozen", "exact"]
 Domain = Literal["continuous", "sampled"]
+Evidence = Literal["proof", "points"]
 
 # Settling for this share of the largest provable rate keeps the metric well conditioned.
 _SHARE = 0.9
@@ -35,7 +36,7 @@ class Certificate:
     """What is guaranteed about a loop, or why nothing is.
 
     Attributes:
-        holds: Whether contraction is proved.
+        holds: Whether contraction is shown, as far as `evidence` says.
         kind: "exact" if the total Jacobian was used, "frozen" if the transforms were held constant,
             which proves nothing about a loop whose transforms move with its state.
         domain: "continuous", or "sampled" with a zero-order hold.
@@ -46,6 +47,8 @@ class Certificate:
         region: Where it holds, in words.
         reason: Why it holds, or does not, in words.
         refused: Whether the question could not be asked at all.
+        evidence: "proof" if the argument covers the whole region, "points" if the Jacobians were
+            looked at on points of it and nothing is said about those between.
     """
 
     holds: bool
@@ -57,6 +60,7 @@ class Certificate:
     region: str = "everywhere"
     reason: str = ""
     refused: bool = False
+    evidence: Evidence = "proof"
 
     def __bool__(self) -> bool:
         return self.holds
@@ -67,7 +71,8 @@ class Certificate:
         return float("nan") if self.metric is None else float(overshoot(self.metric))
 
     def __str__(self) -> str:
-        verdict = "refused" if self.refused else "contracting" if self.holds else "not proved"
+        shown = "contracting" if self.evidence == "proof" else "contracting at the points tried"
+        verdict = "refused" if self.refused else shown if self.holds else "not proved"
         line = f"{verdict} ({self.kind}, {self.domain}), {self.region}"
         if self.holds:
             line += f": rate {self.rate:.3g} 1/s, overshoot at most {self.overshoot:.3g}"

@@ -99,7 +99,7 @@ def certify(
         answer = _by_dimension(space, lower, upper, h, kind)
     else:
         answer = _all_at_once(space, lower, upper, h, kind)
-    return replace(answer, region=looked)
+    return replace(answer, region=looked, evidence="proof" if constant else "points")
 
 
 def _slopes(policy: Any, n: int) -> tuple[Array, Array]:

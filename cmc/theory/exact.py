@@ -221,6 +221,7 @@ def _cutting_planes(vertices: Array, checks: Array, h: float | None) -> Certific
                 metric=answer.metric,
                 reason=f"one metric at all {total} points of the box that were looked at, "
                 "while the trajectories stay in it",
+                evidence="points",
             )
         worst = np.argsort(rates)[:20]
         vertices = np.concatenate([vertices, checks[worst]])
