@@ -10,18 +10,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cmc import store
 from cmc.envs.panda_task import CRITIC, PandaTask
 from cmc.learning.low_level import LowLevel, Segment, evaluate, under
-from cmc.learning.replay import Replay
+from cmc.learning.planning import Planning
+from cmc.learning.replay import Batch, Replay
+from cmc.learning.saved import save_training, saved_training
 from cmc.learning.td3 import TD3
 
 Array = NDArray[np.float64]
+JOINT_STATE = ("joints", "joint_velocity", "joint_error")
+"""Observation fields of a low level that moves joints."""
 
 
 @dataclass(frozen=True)
@@ -56,33 +59,22 @@ class HierarchyConfig:
             raise ValueError(f"updates and warm_up must not be negative: {self}")
 
 
-@dataclass(frozen=True)
-class Planning:
-    """How a task's observations and sub-goals are normalized for the planner.
+class Relabeller(Protocol):
+    """What stores a finished segment beside the planner's transition and relabels samples."""
 
-    Attributes:
-        shift, scale: observation fields of the planner to (field - shift) * scale, by name; fields
-            that are not named stay as they are.
-        low, high: ends of the sub-goal's range, which the planner's [-1, 1] is mapped to.
-    """
+    size: int
 
-    shift: Mapping[str, Array]
-    scale: Mapping[str, Array]
-    low: Array
-    high: Array
+    def pack(self, segment: Segment) -> Array:
+        """What is stored with the transition, (seeds, N, size)."""
 
-    def observe(self, task: PandaTask, observation: Array) -> Array:
-        """The planner's normalized view of observations (..., size)."""
-        parts = [
-            (observation[..., task.layout[name]] - self.shift.get(name, np.zeros(1)))
-            * self.scale.get(name, np.ones(1))
-            for name in task.high_level
-        ]
-        return np.concatenate(parts, axis=-1)
+    def relabel(self, batch: Batch) -> Batch:
+        """A sample with other sub-goals."""
 
-    def subgoal(self, action: Array) -> Array:
-        """Sub-goal in the task's units from an action in [-1, 1]."""
-        return self.low + 0.5 * (action + 1.0) * (self.high - self.low)
+    def state(self) -> list[Any]:
+        """All that is needed to continue."""
+
+    def restore(self, state: list[Any]) -> None:
+        """Continue from `state`."""
 
 
 class TwoLevel:
@@ -95,6 +87,7 @@ class TwoLevel:
         low: the low level.
         planning: normalization.
         config: rates and sizes.
+        relabeller: changes the sub-goals of the planner's samples, or None.
     """
 
     def __init__(
@@ -105,6 +98,7 @@ class TwoLevel:
         low: LowLevel,
         planning: Planning,
         config: HierarchyConfig,
+        relabeller: Relabeller | None = None,
     ) -> None:
         if task.num != len(seeds) * config.worlds:
             raise ValueError(f"wanted {len(seeds)} x {config.worlds} worlds, got {task.num}")
@@ -112,38 +106,48 @@ class TwoLevel:
             raise ValueError("an episode must hold a whole number of segments")
         self.task, self.seeds, self.config = task, tuple(seeds), config
         self.planner, self.low, self.planning = planner, low, planning
+        self.relabeller = relabeller
         self.shape = (len(seeds), config.worlds)
         self.steps = 0  # environment steps of each seed
         self._generators = [np.random.default_rng([seed, 1, 17]) for seed in seeds]
         task.seed([1_000_003 * seed + k for seed in seeds for k in range(config.worlds)])
         self._obs = task.reset()
         size = planning.observe(task, self._obs).shape[-1]
-        self.replay = Replay(seeds, size, len(planning.low), config.capacity, stream=1)
+        extra = relabeller.size if relabeller else 0
+        self.replay = Replay(seeds, size, len(planning.low), config.capacity, 1, extra)
+
+    @property
+    def stride(self) -> int:
+        """Environment steps of each seed in a segment."""
+        return self.task.config.horizon * self.config.worlds
 
     def segment(self) -> Array:
         """One sub-goal, its ticks, and the updates that are due; mean rewards (seeds,)."""
         task, planning = self.task, self.planning
         seen = planning.observe(task, self._obs)
-        action = self._choose(self._split(seen))
+        middle = planning.direction(task, self._obs)
+        action = self._choose(self._split(seen), self._split(middle) if middle.ndim else middle)
         obs = task.set_subgoal(planning.subgoal(self._join(action)))
         segment, reward, self._obs, over = rollout(task, self.low, obs, self.shape, explore=True)
         following = planning.observe(task, self._obs)
         gain = self.config.reward_scale * reward
         # An episode ends by its time limit only: the next value always counts.
-        self.replay.add(self._split(seen), action, gain, self._split(following), np.ones_like(gain))
+        parts = (self._split(seen), action, gain, self._split(following), np.ones_like(gain))
+        self.replay.add(*parts, self.relabeller.pack(segment) if self.relabeller else None)
         self.low.record(segment)
         before = self.steps
-        self.steps += task.config.horizon * self.config.worlds
+        self.steps += self.stride
         self._learn(before)
         if over:
             self._obs = task.reset()
         return reward.mean(1)
 
-    def _choose(self, seen: Array) -> Array:
+    def _choose(self, seen: Array, middle: Array) -> Array:
         """The planner's action with noise, or a random one at first; (seeds, worlds, size)."""
         count = (self.config.worlds, len(self.planning.low))
         if self.steps < self.config.warm_up:
-            return np.stack([g.uniform(-1.0, 1.0, count) for g in self._generators])
+            drawn = np.stack([g.uniform(-1.0, 1.0, count) for g in self._generators])
+            return np.clip(middle + drawn, -1.0, 1.0)
         noise = np.stack([g.standard_normal(count) for g in self._generators])
         action = evaluate(self.planner.actor, seen) + self.config.high_noise * noise
         return np.clip(action, -1.0, 1.0)
@@ -153,7 +157,8 @@ class TwoLevel:
         config, start = self.config, self.config.warm_up
         rounds = [max(count - start, 0) / config.samples for count in (before, self.steps)]
         for _ in range(int(rounds[1] * config.high_updates) - int(rounds[0] * config.high_updates)):
-            self.planner.update(self.replay.sample(self.planner.config.batch))
+            batch = self.replay.sample(self.planner.config.batch)
+            self.planner.update(self.relabeller.relabel(batch) if self.relabeller else batch)
         for _ in range(int(rounds[1] * config.low_updates) - int(rounds[0] * config.low_updates)):
             self.low.update()
 
@@ -166,7 +171,7 @@ class TwoLevel:
     def save(self, path: str | Path, record: Mapping[str, Any]) -> None:
         """Write everything that decides what follows, atomically."""
         arrays: dict[str, np.ndarray] = {}
-        state: dict[str, Any] = {"steps": self.steps, "hierarchy": asdict(self.config)}
+        state: dict[str, Any] = {"steps": self.steps, "settings": asdict(self.config)}
         planner, replay, low = self.planner.state(), self.replay.state(), self.low.state()
         for name, part in (("planner", planner), ("replay", replay), ("low", low)):
             tensors, state[name] = part
@@ -174,13 +179,10 @@ class TwoLevel:
         world = self.task.snapshot()
         state["streams"] = world.pop("streams")
         state["noise"] = [g.bit_generator.state for g in self._generators]
+        if self.relabeller:
+            state["relabeller"] = self.relabeller.state()
         arrays |= {f"task/{key}": value for key, value in world.items()}
-        store.save_checkpoint(
-            path,
-            arrays,
-            {"study": "none", "method": "none", **record, "seeds": list(self.seeds), "kind":
-             "training", "state": state},
-        )  # fmt: skip
+        save_training(path, arrays, record, self.seeds, state)
 
     def load(self, path: str | Path, record: Mapping[str, Any]) -> None:
         """Continue from `save`.
@@ -188,16 +190,7 @@ class TwoLevel:
         Raises:
             CheckpointError: if the file is damaged or of another training.
         """
-        arrays, found = store.load_checkpoint(path)
-        wanted = {**record, "seeds": list(self.seeds), "kind": "training"}
-        for key, value in wanted.items():
-            if found.get(key) != value:
-                raise store.CheckpointError(
-                    f"{path}: wanted a training with {key} {value!r}, found {found.get(key)!r}"
-                )
-        state = found["state"]
-        if state["hierarchy"] != asdict(self.config):
-            raise store.CheckpointError(f"{path}: was trained with {state['hierarchy']}")
+        arrays, state = saved_training(path, record, self.seeds, asdict(self.config))
         self.planner.restore(under(arrays, "planner/"), state["planner"])
         self.replay.restore(under(arrays, "replay/"), state["replay"])
         self.low.restore(under(arrays, "low/"), state["low"])
@@ -205,7 +198,14 @@ class TwoLevel:
         self._obs = self.task.restore(world)
         for generator, kept in zip(self._generators, state["noise"], strict=True):
             generator.bit_generator.state = kept
+        if self.relabeller:
+            self.relabeller.restore(state["relabeller"])
         self.steps = int(state["steps"])
+
+
+def low_fields(task: PandaTask) -> tuple[str, ...]:
+    """Observation fields that the low level of a task sees."""
+    return JOINT_STATE if task.config.command == "joint" else CRITIC
 
 
 def rollout(
@@ -228,13 +228,14 @@ def rollout(
     total = np.zeros(task.num)
     limit = np.array(task.config.u_limit)
     over = False
-    seen = task.select(obs, CRITIC).reshape(*shape, -1)
+    fields = low_fields(task)
+    seen = task.select(obs, fields).reshape(*shape, -1)
     views.append(seen)
     for _ in range(task.config.horizon):
         action = low.act(seen, explore)
         obs, reward, _, truncated, info = task.step(action.reshape(task.num, -1) * limit)
         total += reward
-        seen = task.select(obs, CRITIC).reshape(*shape, -1)
+        seen = task.select(obs, fields).reshape(*shape, -1)
         views.append(seen)
         actions.append(action)
         forces.append(info["contact_force_max"].reshape(shape))

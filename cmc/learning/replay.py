@@ -19,7 +19,7 @@ class Batch:
     """Transitions of all seeds: observation, action, reward, next observation, continues.
 
     Shapes are (seeds, batch, size), and (seeds, batch) for reward and continues. `continues` is 1
-    where the next state's value counts and 0 where it does not.
+    where the next state's value counts and 0 where it does not; `extra` is what else was stored.
     """
 
     observation: Tensor
@@ -27,6 +27,7 @@ class Batch:
     reward: Tensor
     next_observation: Tensor
     continues: Tensor
+    extra: Tensor
 
 
 class Replay:
@@ -41,17 +42,24 @@ class Replay:
         action: size of an action.
         capacity: transitions kept for each seed.
         stream: separates generators that share their seeds (two levels, say).
+        extra: size of what else is stored with a transition.
     """
 
     def __init__(
-        self, seeds: Sequence[int], observation: int, action: int, capacity: int, stream: int = 0
+        self,
+        seeds: Sequence[int],
+        observation: int,
+        action: int,
+        capacity: int,
+        stream: int = 0,
+        extra: int = 0,
     ) -> None:
-        if capacity < 1 or observation < 1 or action < 1 or not seeds:
+        if capacity < 1 or observation < 1 or action < 1 or extra < 0 or not seeds:
             raise ValueError(
                 "wanted seeds and positive sizes; got "
                 f"{len(seeds)} seeds, observation {observation}, action {action}, {capacity} rows"
             )
-        self.sizes = (observation, action, 1, observation, 1)
+        self.sizes = (observation, action, 1, observation, 1, extra)
         self.capacity = capacity
         self.rows: Array32 = np.zeros((len(seeds), capacity, sum(self.sizes)), dtype=np.float32)
         self.written = 0
@@ -67,11 +75,14 @@ class Replay:
         reward: ArrayLike,
         next_observation: ArrayLike,
         continues: ArrayLike,
+        extra: ArrayLike | None = None,
     ) -> None:
         """Add transitions (seeds, count, size); reward and continues are (seeds, count)."""
-        parts = [np.asarray(part, dtype=np.float32) for part in
-                 (observation, action, reward, next_observation, continues)]  # fmt: skip
+        given = (observation, action, reward, next_observation, continues)
+        parts = [np.asarray(part, dtype=np.float32) for part in given]
         parts[2], parts[4] = parts[2][..., None], parts[4][..., None]
+        if extra is not None:
+            parts.append(np.asarray(extra, dtype=np.float32))
         new = np.concatenate(parts, axis=-1)
         if new.shape[0] != len(self.rows) or new.shape[2] != self.rows.shape[2]:
             raise ValueError(
@@ -89,8 +100,8 @@ class Replay:
             [generator.integers(len(self), size=size) for generator in self._generators]
         )
         rows = torch.from_numpy(self.rows[np.arange(len(self.rows))[:, None], drawn])
-        observation, action, reward, following, continues = rows.split(self.sizes, dim=-1)
-        return Batch(observation, action, reward[..., 0], following, continues[..., 0])
+        observation, action, reward, following, continues, extra = rows.split(self.sizes, dim=-1)
+        return Batch(observation, action, reward[..., 0], following, continues[..., 0], extra)
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """All that is needed to continue: the rows in use, the counter, the generators."""

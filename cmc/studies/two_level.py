@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from cmc.envs.panda_task import PandaTask, PandaTaskConfig
-from cmc.learning.hierarchy import HierarchyConfig, Planning, TwoLevel
+from cmc.learning.hierarchy import HierarchyConfig, TwoLevel
 from cmc.learning.latent_rollout import LatentConfig, LatentLow, LatentModel
 from cmc.learning.low_level import (
     CriticLow,
@@ -21,6 +21,7 @@ from cmc.learning.low_level import (
     ModularActor,
     set_gain,
 )
+from cmc.learning.planning import Planning
 from cmc.learning.td3 import TD3, TD3Config
 from cmc.policies import IndependentNetwork, PositiveNetwork, StackedMLP, tanh
 

@@ -1,0 +1,133 @@
+"""PPO as a planner without a low level: one environment step is a segment with u = 0."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
+from torch import nn
+
+from cmc.envs.panda_task import PandaTask
+from cmc.learning import training_state
+from cmc.learning.hierarchy import rollout
+from cmc.learning.low_level import Fixed
+from cmc.learning.planning import Planning
+from cmc.learning.ppo import PPO, PPOConfig
+from cmc.learning.saved import save_training, saved_training
+
+Array32 = NDArray[np.float32]
+
+
+class SegmentEnv(VectorEnv[Array32, Array32, NDArray[Any]]):
+    """A task as a planner without a low level sees it; a step is a segment with u = 0.
+
+    Observations are normalised, actions are sub-goals in [-1, 1] (others are clipped), rewards are
+    means over the segment times `reward_scale`. Episodes are truncated by their time limit, and
+    reset from outside only.
+
+    Args:
+        task: its worlds are the environments.
+        planning: normalisation.
+        reward_scale: factor on rewards.
+    """
+
+    def __init__(self, task: PandaTask, planning: Planning, reward_scale: float = 1.0) -> None:
+        self.task, self.planning, self.reward_scale = task, planning, reward_scale
+        self.num_envs = task.num
+        size, ends = planning.observe(task, task.reset()).shape[-1], len(planning.low)
+        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (ends,), np.float32)
+        self._idle = Fixed(None, task.config.low_size)
+
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array32, dict[str, Any]]:
+        """Start all episodes anew; `seed` is one integer for each equal group of worlds."""
+        if seed is not None:
+            seeds = np.atleast_1d(seed)
+            if self.num_envs % len(seeds):
+                raise ValueError(
+                    f"wanted seeds that divide {self.num_envs} worlds equally, got {len(seeds)}"
+                )
+            each = self.num_envs // len(seeds)
+            self.task.seed([int(s) + k for s in seeds for k in range(each)])
+        return self._seen(self.task.reset()), {}
+
+    def step(
+        self, actions: Array32
+    ) -> tuple[Array32, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        """One segment of every world."""
+        aim = self.planning.subgoal(np.clip(actions.astype(np.float64), -1.0, 1.0))
+        obs = self.task.set_subgoal(aim)
+        _, reward, obs, over = rollout(self.task, self._idle, obs, (1, self.num_envs), False)
+        gain = self.reward_scale * reward[0]
+        ended, limit = np.zeros(self.num_envs, bool), np.full(self.num_envs, over)
+        return self._seen(obs), gain, ended, limit, {}
+
+    def _seen(self, obs: NDArray[np.float64]) -> Array32:
+        return self.planning.observe(self.task, obs).astype(np.float32)
+
+
+@dataclass
+class _Planner:
+    """The actor under the name by which trainings of two levels hold theirs."""
+
+    actor: nn.Module
+
+
+@dataclass
+class OneLevelPPO:
+    """PPO on `SegmentEnv`, with the face of a two-level training.
+
+    Attributes:
+        env: several worlds of each seed.
+        actor: the policy.
+        seeds: one integer for each seed.
+        config: hyperparameters; an update is whole episodes.
+    """
+
+    env: SegmentEnv
+    actor: nn.Module
+    seeds: Sequence[int]
+    config: PPOConfig
+    low: Fixed = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.planner, self.low = _Planner(self.actor), Fixed(None, self.env.task.config.low_size)
+        self.ppo = PPO(self.env, self.actor, self.seeds, self.config)
+
+    @property
+    def stride(self) -> int:
+        """Environment steps of each seed in an update."""
+        each = self.env.num_envs // len(self.seeds)
+        return self.config.steps * self.env.task.config.horizon * each
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of each seed so far."""
+        return self.ppo.updates * self.stride
+
+    def segment(self) -> NDArray[np.float64]:
+        """One update; mean rewards (seeds,)."""
+        total = self.ppo.update()["episode_return"]
+        return np.asarray(total / (self.config.steps * self.env.reward_scale), dtype=np.float64)
+
+    def save(self, path: str | Path, record: Mapping[str, Any]) -> None:
+        """Write everything that decides what follows, atomically."""
+        state = {"settings": asdict(self.config)}
+        save_training(path, training_state.take(self.ppo), record, self.seeds, state)
+
+    def load(self, path: str | Path, record: Mapping[str, Any]) -> None:
+        """Continue from `save`.
+
+        Raises:
+            CheckpointError: if the file is damaged or of another training.
+        """
+        arrays, _ = saved_training(path, record, self.seeds, asdict(self.config))
+        training_state.put(self.ppo, arrays)
