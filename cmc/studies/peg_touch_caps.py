@@ -55,8 +55,8 @@ def _separate(share: float) -> Options:
 
 
 def _bypass(proportional: float, integral: float) -> Options:
-    """Put these shares of the room into the linear bypass."""
-    split = np.array([proportional, integral])
+    """Put these shares of the vertical room into the linear bypass; horizontally no cap binds."""
+    split = np.array([[0.0, 0.0], [proportional, integral]])
     return lambda limit, h: _joint(limit, h, slope_min=limit[:, None] * split / [1.0, h / 2])
 
 
@@ -75,10 +75,16 @@ VARIANTS: dict[str, Variant] = {
     ),
     "joint_bypass_i": Variant("joint cap, a quarter in a bypass of k2", _bypass(0.0, 0.25)),
     "joint_bypass_p": Variant("joint cap, a quarter in a bypass of k1", _bypass(0.25, 0.0)),
-    "joint_linear": Variant("joint cap, nine tenths in a bypass of k2", _bypass(0.0, 0.9)),
+    "joint_bypass": Variant("joint cap, most of it in a bypass", _bypass(0.15, 0.6)),
     "scaled": Variant("joint cap on the loop gain", _joint, scaled=True),
     "scaled_quiet": Variant(
         "joint cap on the loop gain, little noise", _joint, scaled=True, log_std=(-1.0, -3.0)
+    ),
+    "scaled_bypass": Variant(
+        "joint cap on the loop gain, most of it in a bypass, little noise",
+        _bypass(0.2, 0.5),
+        scaled=True,
+        log_std=(-1.0, -3.0),
     ),
     "scaled_odd": Variant(
         "joint cap on the loop gain, little noise, no biases",
