@@ -202,6 +202,12 @@ def test_a_callback_must_return_a_mapping_and_titles_need_their_keys():
         picture.encode([PANEL], {"t": np.zeros(2), "y": np.zeros(2)})
 
 
+def test_titles_are_filled_outside_of_mathematics():
+    data = {"rate": np.array([0.25]), "t": np.zeros(2), "name": "F"}
+    assert picture.fill("$F_{11}$ at {rate:.1f} 1/s", data) == "$F_{11}$ at 0.2 1/s"
+    assert picture.fill("{name} and $x^{rate}$", data) == "F and $x^{rate}$"
+
+
 def test_arrows_point_along_the_field_and_stay_in_their_cell():
     grid = np.stack(np.meshgrid(np.linspace(-2, 2, 9), np.linspace(-10, 10, 6)), axis=-1)
     field = np.random.default_rng(1).normal(size=grid.shape) * [1.0, 30.0]

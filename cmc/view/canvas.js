@@ -303,11 +303,33 @@ function drawCells(ctx, panel, layer, get, cursor, width, height) {
   if (panel.title) drawText(ctx, panel.title, 8, 19);
 }
 
-function drawLegend(ctx, ax, layers) {
+// The corner of the axes in which the fewest points lie under the legend.
+function legendCorner(ax, layers, get, width, height) {
+  const { left, top, right, bottom } = ax.box;
+  const corners = [
+    [right - width, top + 2], [left + 4, top + 2],
+    [right - width, bottom - height - 4], [left + 4, bottom - height - 4],
+  ];
+  const hits = [0, 0, 0, 0];
+  for (const layer of layers) {
+    if (layer.kind !== "lines" && layer.kind !== "points") continue;
+    const x = get(layer.x), y = get(layer.y);
+    const step = Math.max(1, Math.floor(y.length / 2000));
+    for (let k = 0; k < y.length; k += step) {
+      const px = ax.x(x[k % x.length]), py = ax.y(y[k]);
+      corners.forEach(([cx, cy], c) => {
+        if (px > cx && px < cx + width && py > cy && py < cy + height) hits[c] += 1;
+      });
+    }
+  }
+  return corners[hits.indexOf(Math.min(...hits))];
+}
+
+function drawLegend(ctx, ax, layers, get) {
   const named = layers.filter((layer) => layer.label);
   if (!named.length) return;
   const width = Math.max(...named.map((layer) => textWidth(ctx, layer.label, SMALL))) + 34;
-  const x = ax.box.right - width, y = ax.box.top + 2;
+  const [x, y] = legendCorner(ax, layers, get, width, 18 * named.length + 4);
   ctx.globalAlpha = 0.82;
   ctx.fillStyle = "white";
   ctx.fillRect(x, y, width, 18 * named.length + 4);
@@ -363,7 +385,7 @@ function drawPanel(canvas, panel, get, cursor) {
   }
   ctx.restore();
   ctx.globalAlpha = 1;
-  drawLegend(ctx, ax, panel.layers);
+  drawLegend(ctx, ax, panel.layers, get);
 }
 
 // ---- the widget

@@ -113,8 +113,9 @@ def limits(extents: Sequence[np.ndarray], *, log: bool) -> tuple[float, float]:
 
 
 def fill(text: str, data: Data) -> str:
-    """Fill `{key}` fields of a title from the numbers and words of `data`."""
-    if "{" not in text:
+    """Fill `{key}` fields of a title, outside of `$...$`, from the numbers and words of `data`."""
+    parts = text.split("$")  # every second part is mathematics, whose braces are its own
+    if not any("{" in part for part in parts[::2]):
         return text
     plain = {
         key: value.item()
@@ -123,8 +124,9 @@ def fill(text: str, data: Data) -> str:
         for key, value in data.items()
     }
     try:
-        return text.format(**plain)
+        parts[::2] = [part.format(**plain) for part in parts[::2]]
     except (KeyError, IndexError, ValueError, TypeError) as error:
         raise PictureError(
             f"cannot fill the title {text!r} from {sorted(data)}: {error}"
         ) from error
+    return "$".join(parts)
