@@ -197,7 +197,7 @@ def test_killed_training_resumes_exactly(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(root)}
     process = subprocess.Popen([sys.executable, "-c", SCRIPT, str(path)], env=environment, cwd=root)
     try:
-        for _ in range(1200):
+        for _ in range(2400):
             if path.exists() or process.poll() is not None:
                 break
             time.sleep(0.05)

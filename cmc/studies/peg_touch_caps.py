@@ -93,6 +93,10 @@ VARIANTS: dict[str, Variant] = {
         log_std=(-1.0, -3.0),
     ),
     "joint_quiet": Variant("joint cap, little noise", _joint, log_std=(-1.0, -3.0)),
+    "none_bypass": Variant(
+        "no cap, the same bypass",
+        lambda limit, h: {"slope_min": _bypass(0.15, 0.6)(limit, h)["slope_min"]},
+    ),
     "none_quiet": Variant("no cap, little noise", lambda limit, h: {}, log_std=(-1.0, -3.0)),
 }
 
