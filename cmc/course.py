@@ -12,6 +12,8 @@ import sys
 import webbrowser
 from pathlib import Path
 
+from cmc.store import asset
+
 FIRST = "00_start_here.ipynb"
 
 
@@ -83,6 +85,9 @@ def main(arguments: list[str] | None = None) -> int:
     except FileNotFoundError as error:
         print(error)
         return 2
+    # Settings that keep JupyterLab from asking whether it may fetch news.
+    folders = [str(asset("jupyter")), *filter(None, [os.environ.get("JUPYTER_CONFIG_PATH")])]
+    os.environ["JUPYTER_CONFIG_PATH"] = os.pathsep.join(folders)
     root = hasattr(os, "geteuid") and os.geteuid() == 0
     browser = _has_browser() and not options.no_browser
     command = [sys.executable, "-m", "jupyterlab"]

@@ -83,7 +83,10 @@ function logTicks(low, high) {
 }
 
 function tickText(value, log) {
-  if (log) return Number.isInteger(value) ? `$10^{${value}}$` : (10 ** value).toPrecision(2);
+  if (log) {
+    const power = String(value).replace("-", "−");
+    return Number.isInteger(value) ? `$10^{${power}}$` : (10 ** value).toPrecision(2);
+  }
   if (value === 0 || Math.abs(value) < 1e-12) return "0";
   const size = Math.abs(value);
   if (size >= 1e5 || size < 1e-3) return value.toExponential(1).replace("e+", "e").replace("-", "−");
@@ -120,7 +123,7 @@ class Axes {
 
   draw(ctx, panel) {
     const { left, top, right, bottom } = this.box;
-    const xs = ticks(this.x0, this.x1, (right - left) / 70);
+    const xs = ticks(this.x0, this.x1, (right - left) / 55);
     const ys = this.log ? logTicks(this.y0, this.y1) : ticks(this.y0, this.y1, (bottom - top) / 45);
     ctx.strokeStyle = "#E4E4E4";
     ctx.lineWidth = 1;
