@@ -28,6 +28,10 @@ def small(study: two_level.TwoLevelStudy) -> two_level.TwoLevelStudy:
         planner=replace(study.planner, critic_hidden=(16,), batch=16),
         low=replace(study.low, critic_hidden=(16,), batch=16, critic_head_start=0),
         task=replace(study.task, ticks=60),
+        joint_task=study.joint_task and replace(study.joint_task, ticks=60),
+        joint_hidden=(8,),
+        latent=replace(study.latent, batch=8),
+        ppo=replace(study.ppo, critic_hidden=(8,), epochs=2, minibatches=2),
         **tiny,
     )
 
@@ -36,15 +40,18 @@ def weights(path: Path) -> dict[str, np.ndarray]:
     return store.load_checkpoint(path)[0]
 
 
-@pytest.mark.parametrize("name", two_level.METHODS)
-@pytest.mark.parametrize("study", [peg_maze.STUDY, peg_push.STUDY], ids=["maze", "push"])
+EVERY = [(peg_maze.STUDY, name) for name in peg_maze.STUDY.methods]
+SOME = [(peg_push.STUDY, name) for name in ("ctd3", "td3_corrected", "ppo_control")]
+
+
+@pytest.mark.parametrize(("study", "name"), EVERY + SOME, ids=lambda x: getattr(x, "name", x))
 def test_every_method_trains_and_loads(study, name: str, tmp_path: Path) -> None:
     study = small(study)
     path = train(study, name, [0, 3], steps=240, out=tmp_path)
     assert marks(study, name, path) == [120, 240]
     planner, low, record = load(study, name, path=path)
     assert record["seeds"] == [0, 3]
-    found = two_level_evaluation.run_episodes(study, planner, low, seeds=2, episodes=2)
+    found = two_level_evaluation.run_episodes(study.of(name), planner, low, seeds=2, episodes=2)
     figures = two_level_evaluation.summary(found)
     assert np.isfinite(figures["return"]).all()
     assert figures["force"]["largest"]["below_5_N"] <= 1.0
@@ -54,16 +61,16 @@ def test_every_method_trains_and_loads(study, name: str, tmp_path: Path) -> None
         for key in trained
         if key.startswith("00000240.low.")
     ]
-    learns = two_level.METHODS[name].low in ("latent", "critic")
+    learns = study.method(name).low in ("latent", "critic", "hiro")
     assert any(moved) == learns
 
 
 def test_a_run_that_was_stopped_ends_with_the_same_weights(tmp_path: Path) -> None:
     study = small(peg_maze.STUDY)
-    for name in ("ctd3", "td3_corrected"):
-        whole = train(study, name, [1, 2], steps=480, out=tmp_path / "whole")
+    for name in ("ctd3", "td3_corrected", "hiro", "ppo_control"):
+        whole = train(study, name, [1, 2], steps=360, out=tmp_path / "whole")
         train(study, name, [1, 2], steps=240, out=tmp_path / "parts")
-        parts = train(study, name, [1, 2], steps=480, out=tmp_path / "parts")
+        parts = train(study, name, [1, 2], steps=360, out=tmp_path / "parts")
         expected = weights(whole)
         for key, value in weights(parts).items():
             np.testing.assert_array_equal(value, expected[key], err_msg=f"{name} {key}")
@@ -73,7 +80,7 @@ def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
     program = (
         "import sys; sys.path.insert(0, 'tests')\n"
         "from test_studies_two_level import *\n"
-        f"train(small(peg_maze.STUDY), 'ctd3', [0], steps=1200, out={str(tmp_path / 'killed')!r})"
+        f"train(small(peg_maze.STUDY), 'ctd3', [0], steps=720, out={str(tmp_path / 'killed')!r})"
     )
     root = Path(__file__).resolve().parent.parent
     process = subprocess.Popen([sys.executable, "-c", program], cwd=root)
@@ -84,8 +91,8 @@ def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
     process.send_signal(signal.SIGKILL)
     process.wait()
     study = small(peg_maze.STUDY)
-    resumed = train(study, "ctd3", [0], steps=1200, out=tmp_path / "killed")
-    whole = train(study, "ctd3", [0], steps=1200, out=tmp_path / "whole")
+    resumed = train(study, "ctd3", [0], steps=720, out=tmp_path / "killed")
+    whole = train(study, "ctd3", [0], steps=720, out=tmp_path / "whole")
     expected = weights(whole)
     for key, value in weights(resumed).items():
         np.testing.assert_array_equal(value, expected[key], err_msg=key)
@@ -95,8 +102,12 @@ def test_bad_requests_are_named(tmp_path: Path) -> None:
     study = small(peg_maze.STUDY)
     with pytest.raises(ValueError, match="unknown method 'sac'"):
         train(study, "sac", [0], out=tmp_path)
+    with pytest.raises(ValueError, match="unknown method 'hiro'"):
+        train(small(peg_push.STUDY), "hiro", [0], out=tmp_path)
     with pytest.raises(ValueError, match="at least one, got none"):
         train(study, "frozen", [], out=tmp_path)
+    with pytest.raises(ValueError, match="two segments for each of 9 minibatches, got 6"):
+        train(replace(study, ppo=replace(study.ppo, minibatches=9)), "ppo_control", [0])
     path = train(study, "frozen", [0], steps=120, out=tmp_path)
     with pytest.raises(store.CheckpointError, match="study 'peg_push'"):
         load(small(peg_push.STUDY), "frozen", path=path)

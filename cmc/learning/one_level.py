@@ -114,7 +114,16 @@ class OneLevelPPO:
         return self.ppo.updates * self.stride
 
     def segment(self) -> NDArray[np.float64]:
-        """One update; mean rewards (seeds,)."""
+        """One update; mean rewards (seeds,).
+
+        Raises:
+            ValueError: if it has fewer than two segments for each minibatch.
+        """
+        size = self.config.steps * (self.env.num_envs // len(self.seeds))
+        if size < 2 * self.config.minibatches:
+            raise ValueError(
+                f"wanted two segments for each of {self.config.minibatches} minibatches, got {size}"
+            )
         total = self.ppo.update()["episode_return"]
         return np.asarray(total / (self.config.steps * self.env.reward_scale), dtype=np.float64)
 

@@ -1,34 +1,27 @@
-"""What the two peg studies share: methods, how they are built, trained, evaluated and loaded."""
+"""What the two peg studies share: their methods and their configuration."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
-from cmc.envs.panda_task import PandaTask, PandaTaskConfig
-from cmc.learning.hierarchy import HierarchyConfig, TwoLevel
-from cmc.learning.latent_rollout import LatentConfig, LatentLow, LatentModel
-from cmc.learning.low_level import (
-    CriticLow,
-    Fixed,
-    LowLevel,
-    ModularActor,
-    set_gain,
-)
+from cmc.envs.panda_config import PandaTaskConfig
+from cmc.envs.panda_task import HIGH_LEVEL, PandaTask
+from cmc.learning.hierarchy import HierarchyConfig
+from cmc.learning.latent_rollout import LatentConfig
 from cmc.learning.planning import Planning
-from cmc.learning.td3 import TD3, TD3Config
-from cmc.policies import IndependentNetwork, PositiveNetwork, StackedMLP, tanh
+from cmc.learning.ppo import PPOConfig
+from cmc.learning.td3 import TD3Config
+from cmc.robot.panda import FINGERTIP, inverse_kinematics
 
 Array = NDArray[np.float64]
 Callback = Callable[[dict[str, Any]], object]
-N = 6  # dimensions of a pose
-ACTOR_SIZE, CRITIC_SIZE = 2 * N, 4 * N + 1  # (y, int y), and with error, velocity, time to go
+HIRO_HALF = 0.1
+"""Half-range of HIRO's joint increments, rad (appendix G)."""
 
 
 @dataclass(frozen=True)
@@ -38,17 +31,23 @@ class Arm:
     Attributes:
         title: in figures.
         low: "latent" learns through the latent model, "critic" from a critic, "frozen" keeps its
-            random start, "gain" is a fixed slope, "none" does not act.
+            random start, "gain" is a fixed slope, "none" does not act, "hiro" moves joints and
+            relabels the planner's sub-goals.
         positive: positive weights, else free ones.
         capped: no biases, and slopes kept below the sampled-data cap.
         corrected: the critic sees the full state and learns the segment's return.
+        planner: the planner's algorithm.
+        noise: exploration of planner and low level, in half-ranges; the defaults if None.
+        trained: whether it can be trained.
     """
 
     title: str
-    low: Literal["latent", "critic", "frozen", "gain", "none"]
+    low: Literal["latent", "critic", "frozen", "gain", "none", "hiro"]
     positive: bool = True
     capped: bool = True
     corrected: bool = False
+    planner: Literal["td3", "ppo"] = "td3"
+    noise: tuple[float, float] | None = None
     trained: bool = True
 
 
@@ -62,6 +61,9 @@ METHODS: dict[str, Arm] = {
         "TD3/TD3, corrected critic", "critic", positive=False, capped=False, corrected=True
     ),
     "control": Arm("TD3/Control", "none"),
+    "ppo_control": Arm("PPO/Control", "none", planner="ppo"),
+    "hiro": Arm("HIRO", "hiro", noise=(1.0, 1.0)),
+    "hiro_matched": Arm("HIRO, matched noise", "hiro", noise=(0.3, 0.1)),
 }
 
 
@@ -86,6 +88,12 @@ class TwoLevelStudy:
         steps: environment steps of each seed.
         snapshot_every: steps between two kept policies.
         episodes: test episodes of each seed.
+        ppo: PPO in place of the planner's TD3; `steps` is replaced by an episode's segments.
+        fields: what the planner sees; the task's own if None.
+        joint_task: the task in joint space, for HIRO; without one there is no HIRO.
+        joint_aim: tip position that HIRO's random sub-goals of the warm-up lie around, m.
+        joint_hidden: hidden sizes of HIRO's low level (our choice).
+        joint_stride: ticks between those whose likelihood counts in relabelling (our choice).
     """
 
     name: str
@@ -105,6 +113,46 @@ class TwoLevelStudy:
     cap: float = 1.2
     mass: tuple[float, float, float] = (1.75, 3.93, 7.17)
     episodes: int = 100
+    ppo: PPOConfig = field(
+        default_factory=lambda: PPOConfig(gamma=0.5, epochs=10, learning_rate=1e-3)
+    )
+    fields: tuple[str, ...] | None = None
+    joint_task: PandaTaskConfig | None = None
+    joint_aim: tuple[float, float, float] | None = None
+    joint_hidden: tuple[int, ...] = (64, 64)
+    joint_stride: int = 4
+
+    @property
+    def methods(self) -> dict[str, Arm]:
+        """The methods of this study, by name."""
+        return {k: arm for k, arm in METHODS.items() if arm.low != "hiro" or self.joint_task}
+
+    def method(self, name: str) -> Arm:
+        """The arm of this name.
+
+        Raises:
+            ValueError: if there is none.
+        """
+        if name not in self.methods:
+            raise ValueError(f"unknown method {name!r}; wanted one of {', '.join(self.methods)}")
+        return self.methods[name]
+
+    def of(self, name: str) -> TwoLevelStudy:
+        """The study as a method runs it: HIRO has another task, and a planner that sees joints.
+
+        Raises:
+            ValueError: if there is no such method.
+        """
+        if self.method(name).low != "hiro" or self.joint_task is None:
+            return self
+        start = tuple(start_joints(self.joint_task))
+        return replace(
+            self,
+            task=self.joint_task,
+            fields=(*HIGH_LEVEL, "joints"),
+            shift={**self.shift, "joints": start},
+            scale={**self.scale, "joints": 1.0 / HIRO_HALF},
+        )
 
     def planning(self) -> Planning:
         """Normalization of the planner's observations and sub-goals."""
@@ -113,7 +161,15 @@ class TwoLevelStudy:
             {name: np.asarray(value, dtype=float) for name, value in self.scale.items()},
             np.array(self.task.subgoal_low),
             np.array(self.task.subgoal_high),
+            self.fields,
+            self._joint_aim(),
         )
+
+    def _joint_aim(self) -> Array | None:
+        if self.task.command != "joint" or self.joint_aim is None:
+            return None
+        tool = FINGERTIP + self.task.peg.length
+        return inverse_kinematics(self.joint_aim, tool=tool, q0=start_joints(self.task))
 
     def slope_cap(self) -> Array:
         """Largest slope d pi / dy that keeps (K_d + g K2) dt below the cap, (6,)."""
@@ -122,122 +178,6 @@ class TwoLevelStudy:
         return room / (latent.K2 * np.array(self.task.u_limit))
 
 
-class Planner(nn.Module):
-    """Sub-goals in [-1, 1] from normalized observations."""
-
-    def __init__(self, inputs: int, outputs: int, hidden: Sequence[int], seeds: Sequence[int]):
-        super().__init__()
-        self.net = StackedMLP(inputs, outputs, hidden, seeds=seeds)
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """Actions (seeds, batch, outputs)."""
-        return tanh(self.net(observation))
-
-
-class Gain(nn.Module):
-    """u_i = tanh(g_i (y_i + integral of y_i)): a hand-tuned low level."""
-
-    def __init__(self, gain: Array) -> None:
-        super().__init__()
-        self.gain = nn.Parameter(torch.as_tensor(gain, dtype=torch.float32), requires_grad=False)
-
-    def forward(self, s: Tensor) -> Tensor:
-        """Values (seeds, batch, n) for s (seeds, batch, n, 2)."""
-        return self.gain * s.sum(-1)
-
-
-def method(name: str) -> Arm:
-    """The arm of this name.
-
-    Raises:
-        ValueError: if there is none.
-    """
-    if name not in METHODS:
-        raise ValueError(f"unknown method {name!r}; wanted one of {', '.join(METHODS)}")
-    return METHODS[name]
-
-
-def build_low(study: TwoLevelStudy, name: str, seeds: Sequence[int]) -> LowLevel:
-    """The low level of a method, untrained."""
-    arm, cap = method(name), study.slope_cap()
-    start = np.minimum(study.start_gain, 0.99 * cap)
-    if arm.low == "none":
-        return Fixed(None, N)
-    if arm.low == "gain":
-        return Fixed(ModularActor(Gain(start), N), N)
-    net: nn.Module
-    if arm.positive:
-        limit = (np.array([1.0, study.task.tick]), cap) if arm.capped else None
-        net = PositiveNetwork(
-            N, hidden=study.low_hidden, seeds=seeds, bias=not arm.capped, joint_cap=limit
-        )
-        if arm.capped:
-            set_gain(net, start)
-    else:
-        net = IndependentNetwork(N, hidden=study.low_hidden, seeds=seeds)
-    actor = ModularActor(net, N)
-    if arm.low == "frozen":
-        return Fixed(actor, N)
-    if arm.low == "latent":
-        return LatentLow(actor, seeds, _latent_model(study), study.task.horizon, study.latent)
-    size = CRITIC_SIZE if arm.corrected else ACTOR_SIZE
-    scale = _critic_scale(study)[:size] if arm.corrected else 1.0
-    agent = TD3(actor, seeds, size, N, study.low, stream=2, scale=scale)
-    weights = {"translation": 100.0 if arm.corrected else 1.0, "rotation": 1.0}
-    return CriticLow(
-        agent,
-        seeds,
-        size,
-        noise=0.5 if arm.corrected else 0.1,
-        whole_return=arm.corrected,
-        weights=weights,
-    )
-
-
-def _latent_model(study: TwoLevelStudy) -> LatentModel:
-    latent = study.task.gains.latent
-    return LatentModel(
-        latent.K_p,
-        latent.K_d,
-        latent.K1,
-        latent.K2,
-        np.array(study.task.u_limit),
-        np.array([*study.mass, 0.0, 0.0, 0.0]),
-        np.repeat([1.0, 0.0], 3),
-        study.task.tick,
-    )
-
-
-def _critic_scale(study: TwoLevelStudy) -> Array:
-    """Brings (y, int y, error, velocity, time to go) of a 5 mm, 0.1 rad sub-goal to order one."""
-    latent = study.task.gains.latent
-    size = np.repeat([0.005, 0.1], 3)
-    y = 1.0 / (latent.K1 * size)
-    return np.concatenate([y, y / 0.4, 1.0 / size, 0.2 / size, [2.5]])
-
-
-def build(study: TwoLevelStudy, name: str, seeds: Sequence[int]) -> TwoLevel:
-    """The trainer of a method.
-
-    Raises:
-        ValueError: for an unknown method, or no seed.
-    """
-    if len(seeds) == 0:
-        raise ValueError("seeds: wanted at least one, got none")
-    arm = method(name)
-    config = study.hierarchy
-    if arm.low in ("frozen", "gain", "none"):
-        config = replace(config, low_updates=0)
-    elif arm.low == "latent":
-        config = replace(config, low_updates=4)
-    task = study.task_class(study.task, num=len(seeds) * config.worlds)
-    planning = study.planning()
-    inputs = planning.observe(task, task.reset()).shape[-1]
-    actor = Planner(inputs, len(planning.low), study.planner_hidden, seeds)
-    planner = TD3(actor, seeds, inputs, len(planning.low), study.planner, stream=1)
-    return TwoLevel(task, seeds, planner, build_low(study, name, seeds), planning, config)
-
-
-def low_actor(low: LowLevel) -> nn.Module | None:
-    """The network of a low level, or None."""
-    return low.agent.actor if isinstance(low, CriticLow) else getattr(low, "actor", None)
+def start_joints(task: PandaTaskConfig) -> Array:
+    """Joint angles of a task's start, (7,), rad."""
+    return inverse_kinematics(task.start, tool=FINGERTIP + task.peg.length)

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from scipy.stats import beta
 from torch import nn
 
-from cmc.envs.panda_task import CRITIC
+from cmc.learning.hierarchy import low_fields
 from cmc.learning.low_level import Fixed, LowLevel, evaluate
-from cmc.studies.two_level import N, TwoLevelStudy
+from cmc.robot.panda import FINGERTIP, JOINTS, inverse_kinematics
+from cmc.studies.two_level import TwoLevelStudy
+from cmc.studies.two_level_parts import N
 
 Array = NDArray[np.float64]
 TEST_SEED = 900_000  # test worlds never share a stream with training
@@ -59,12 +61,13 @@ def run_episodes(
     total, deepest = np.zeros(task.num), np.zeros(task.num)
     nearest, touched = np.full(task.num, np.inf), np.zeros(task.num, dtype=bool)
     force, force_max = [], []
+    fields = low_fields(task)
     for tick in range(study.task.ticks):
         if tick % study.task.horizon == 0:
             seen = planning.observe(task, obs).reshape(*shape, -1)
             aim = planning.subgoal(evaluate(planner, seen))
             obs = task.set_subgoal(aim.reshape(task.num, -1))
-        u = low.act(task.select(obs, CRITIC).reshape(*shape, -1), explore=False)
+        u = low.act(task.select(obs, fields).reshape(*shape, -1), explore=False)
         obs, reward, _, _, info = task.step(u.reshape(task.num, -1) * limit)
         missing = task.select(obs, ("goal",)) - task.select(obs, ("position",))
         distance = np.sqrt((missing**2).sum(-1))
@@ -138,26 +141,42 @@ def consistency(
     obs = task.set_subgoal(np.tile(first, (seeds, 1)))
     _ticks(task, low, obs, seeds, study)
     before = task.worlds.tip.copy()
-    step = np.zeros((task.num, len(low_end)))
-    if not study.task.increments:
-        step[:, :3] = before
-    step[:, 0] += 0.005
-    obs = task.set_subgoal(step)
+    obs = task.set_subgoal(_step_in_x(task, study, 0.005))
     _ticks(task, low, obs, seeds, study)
     moved = (task.worlds.tip - before)[:, 0].reshape(seeds, starts)
     return {"mean": moved.mean(1), "spread": moved.std(1)}
 
 
+def _step_in_x(task: Any, study: TwoLevelStudy, length: float) -> Array:
+    """Sub-goals that ask every world for a step in x, (worlds, size)."""
+    config, tip = study.task, task.worlds.tip
+    step = np.zeros((task.num, config.high_size))
+    if config.command == "joint":
+        tool, joints = FINGERTIP + config.peg.length, task.worlds.qpos[:, :JOINTS]
+        for k, q in enumerate(joints):
+            ends = [
+                inverse_kinematics(x, tool=tool, q0=q) for x in (tip[k], tip[k] + [length, 0, 0])
+            ]
+            step[k] = ends[1] - ends[0]
+        return step
+    if not config.increments:
+        step[:, :3] = tip
+    step[:, 0] += length
+    return step
+
+
 def _ticks(task: Any, low: LowLevel, obs: Array, seeds: int, study: TwoLevelStudy) -> None:
     limit = np.array(study.task.u_limit)
     for _ in range(study.task.horizon):
-        seen = task.select(obs, CRITIC).reshape(seeds, task.num // seeds, -1)
+        seen = task.select(obs, low_fields(task)).reshape(seeds, task.num // seeds, -1)
         u = low.act(seen, explore=False)
-        obs, *_ = task.step(u.reshape(task.num, N) * limit)
+        obs, *_ = task.step(u.reshape(task.num, -1) * limit)
 
 
 def slope_at_rest(study: TwoLevelStudy, low: LowLevel, seeds: int, eps: float = 1e-4) -> Array:
     """Slope du/dy at rest of every dimension, (seeds, 6), by a central difference."""
+    if study.task.command == "joint":
+        raise ValueError("slopes in y: wanted a low level of the tip, got one of the joints")
     if isinstance(low, Fixed) and low.actor is None:
         return np.zeros((seeds, N))
     seen = np.zeros((seeds, 2 * N, 4 * N + 1))

@@ -12,9 +12,10 @@ import torch
 from torch import nn
 
 from cmc import store
-from cmc.learning.low_level import Fixed, LowLevel
+from cmc.learning.low_level import LowLevel
 from cmc.learning.seed_axis import single_thread
-from cmc.studies.two_level import Callback, Planner, TwoLevelStudy, build, low_actor, method
+from cmc.studies.two_level import Callback, TwoLevelStudy
+from cmc.studies.two_level_parts import Planner, build, frozen, low_actor
 
 
 def train(
@@ -47,6 +48,7 @@ def train(
     if total < 1:
         raise ValueError(f"steps: wanted at least 1, got {total}")
     trainer = build(study, name, list(seeds))
+    study = study.of(name)
     folder = Path(out) if out is not None else Path("runs") / study.name
     packed = folder / f"{study.name}_{name}.safetensors"
     state = folder / f"{name}_state.safetensors"
@@ -56,7 +58,7 @@ def train(
     if state.is_file() and packed.is_file():
         trainer.load(state, _identity(record))
         kept, _ = store.load_checkpoint(packed, study=study.name, method=name)
-        curve = list(kept.pop("rewards"))[: trainer.steps // _segment_steps(study)]
+        curve = list(kept.pop("rewards"))[: trainer.steps // trainer.stride]
     while trainer.steps < total:
         with single_thread():
             reward = trainer.segment()
@@ -66,17 +68,13 @@ def train(
             callback({"steps": done, "total_steps": total, "reward": reward})
         last = done >= total
         every = study.snapshot_every
-        if last or done // every > (done - _segment_steps(study)) // every:
-            mark = done if last and done % every >= _segment_steps(study) else done // every * every
+        if last or done // every > (done - trainer.stride) // every:
+            mark = done if last and done % every >= trainer.stride else done // every * every
             for key, value in _weights(trainer.planner.actor, trainer.low).items():
                 kept[f"{mark:08d}.{key}"] = value
             store.save_checkpoint(packed, {**kept, "rewards": np.array(curve)}, record)
             trainer.save(state, _identity(record))
     return packed
-
-
-def _segment_steps(study: TwoLevelStudy) -> int:
-    return study.task.horizon * study.hierarchy.worlds
 
 
 def _weights(planner: nn.Module, low: LowLevel) -> dict[str, np.ndarray]:
@@ -113,7 +111,7 @@ def plain(value: Any) -> Any:
 
 def checkpoint_path(study: TwoLevelStudy, name: str) -> Path:
     """The shipped checkpoints of a method."""
-    method(name)
+    study.method(name)
     return store.asset("checkpoints", f"{study.name}_{name}.safetensors")
 
 
@@ -149,8 +147,8 @@ def load(
     trainer = build(
         replace(study, hierarchy=replace(study.hierarchy, worlds=1)), name, record["seeds"]
     )
-    planner, actor = trainer.planner.actor, low_actor(trainer.low)
-    for part, module in (("planner", planner), ("low", actor)):
+    planner, low = trainer.planner.actor, trainer.low
+    for part, module in (("planner", planner), ("low", low_actor(low))):
         start = f"{mark:08d}.{part}."
         state = {
             key.removeprefix(start): torch.from_numpy(value)
@@ -165,4 +163,4 @@ def load(
                     f"{path}: the weights do not fit this study: {error}"
                 ) from error
     assert isinstance(planner, Planner)
-    return planner.eval(), Fixed(actor), record
+    return planner.eval(), frozen(low), record
