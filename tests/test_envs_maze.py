@@ -137,5 +137,5 @@ def test_softness_is_of_the_peg_and_observed_at_its_true_tip():
     behind = worlds.tip[0, 0] - worlds.nominal[0, 0]
     assert 2e-4 < behind < 5e-3
     np.testing.assert_array_equal(obs[0, :3], worlds.tip[0])
-    spring = 200.0 * behind
+    spring = SOFT.peg.stiffness * behind
     assert spring == pytest.approx(np.linalg.norm(worlds.force[0]), rel=0.25)

@@ -34,7 +34,7 @@ STIFF = PandaTaskConfig(
 """Rigid peg, unit actions: pressing takes newtons, impacts tens of newtons."""
 SOFT = replace(
     STIFF,
-    peg=Peg(length=0.05, stiffness=200.0, damping=8.0),
+    peg=Peg(length=0.05, stiffness=150.0, damping=8.0),
     law=ControlLaw(form="force", split=True, drift=False, error_limit=0.005),
     u_limit=(0.2, 0.2, 0.2, 1.0, 1.0, 1.0),
 )
