@@ -1,0 +1,104 @@
+"""Any Gymnasium environment with a known model, seen and commanded in its auxiliary space."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import ArrayLike, NDArray
+
+from cmc.theory.auxiliary import AuxiliarySpace
+from cmc.theory.tracking import Tracker
+
+Array = NDArray[np.float64]
+Error = Callable[[Array], Array]
+Model = Callable[[Array], tuple[Array, Array]]
+
+
+class AuxiliarySpaceWrapper(gym.Wrapper[NDArray[np.float32], Any, Any, Any]):
+    """Observe (z_i, integral of z_i) and command u = u0 + T_a a, with z = T_y (y - y_d).
+
+    A policy that decreases in all of its inputs, one network per dimension, then meets the paper's
+    sign condition on any plant: R_ii is positive here (`constraint_sign`). Order, sign and scale of
+    the eigenvectors are followed from step to step, so that the integral keeps its meaning.
+
+    Args:
+        env: an environment with Box observations and n commands.
+        error: latent tracking error y - y_d (n,) of an observation.
+        model: f_y and f_u, (n, n) each, at an observation.
+        h: time between two steps [s].
+        u0: command to which T_a a is added, broadcast to (n,).
+        limit: bound of the declared action space; the command is clipped to the env's own.
+        bound: bound of the declared observation space; larger values are clipped to it.
+
+    Raises:
+        TypeError: if the action space is no Box.
+        ValueError: if h is not positive, the action space is not flat, or (at a step) an action or
+            an error has another shape or is not finite.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        *,
+        error: Error,
+        model: Model,
+        h: float,
+        u0: ArrayLike = 0.0,
+        limit: float = 1.0,
+        bound: float = 1e6,
+    ) -> None:
+        super().__init__(env)
+        if not isinstance(env.action_space, spaces.Box):
+            raise TypeError(f"wanted a Box of commands, got {env.action_space}")
+        if len(env.action_space.shape) != 1 or not (np.isfinite(h) and h > 0):
+            raise ValueError(f"wanted flat commands and h > 0, got {env.action_space} and h = {h}")
+        self.n = env.action_space.shape[0]
+        self.error, self.model, self.h = error, model, float(h)
+        self.u0 = np.broadcast_to(np.asarray(u0, dtype=float), (self.n,)).copy()
+        self.action_space = spaces.Box(-limit, limit, (self.n,), np.float32)
+        self.observation_space = spaces.Box(-bound, bound, (2 * self.n,), np.float32)
+        self.integral: Array = np.zeros(self.n)
+        self._tracker = Tracker()
+        self.space: AuxiliarySpace | None = None
+        """T_y, T_a, Lambda and R at the present observation."""
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start an episode; the integral starts with the first error."""
+        obs, info = self.env.reset(seed=seed, options=options)
+        self._tracker.reset()
+        self.integral = np.zeros(self.n)
+        return self._observe(obs), info
+
+    def step(
+        self, action: ArrayLike
+    ) -> tuple[NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
+        """Command u = u0 + T_a a."""
+        if self.space is None:
+            raise gym.error.ResetNeeded("call reset before step")
+        a = np.asarray(action, dtype=float)
+        if a.shape != (self.n,) or not np.isfinite(a).all():
+            raise ValueError(f"action: wanted {self.n} finite numbers, got {a}")
+        inner = self.env.action_space
+        assert isinstance(inner, spaces.Box)
+        command = np.clip(self.u0 + self.space.T_a @ a, inner.low, inner.high)
+        obs, reward, terminated, truncated, info = self.env.step(command.astype(inner.dtype))
+        return self._observe(obs), reward, terminated, truncated, info
+
+    def _observe(self, obs: Any) -> NDArray[np.float32]:
+        seen = np.asarray(obs, dtype=float)
+        e = np.asarray(self.error(seen), dtype=float)
+        if e.shape != (self.n,) or not np.isfinite(e).all():
+            raise ValueError(f"error: wanted {self.n} finite numbers, got {e}")
+        self.space = self._tracker.update(*self.model(seen))
+        z = self.space.T_y @ e
+        self.integral = self.integral + self.h * z  # the new value included, as everywhere
+        s = np.stack([z, self.integral], axis=-1).ravel()
+        box = self.observation_space
+        assert isinstance(box, spaces.Box)
+        return np.clip(s, box.low, box.high).astype(np.float32)
