@@ -51,12 +51,15 @@ def test_every_method_trains_is_kept_and_comes_back(name, tmp_path):
     assert not torch.equal(fresh(obs), both(obs))
 
 
-def test_an_interrupted_run_ends_with_the_same_policies(run, tmp_path):
+@pytest.mark.parametrize("reason", [KeyboardInterrupt, SystemExit])
+def test_a_stopped_run_ends_with_the_same_policies(reason, run, tmp_path):
+    """An interrupt keeps the last update; anything harsher goes back to the last kept policy."""
+
     def stop(report):
         if report["update"] == 3:
-            raise KeyboardInterrupt
+            raise reason
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(reason):
         peg_touch.train("cppo_bounded", [3, 5], out=tmp_path, study=SMALL, callback=stop)
     resumed = peg_touch.train("cppo_bounded", [3, 5], out=tmp_path, study=SMALL)
     wanted, _ = store.load_checkpoint(run)
@@ -169,20 +172,26 @@ def test_caps_hold_for_any_weights(name):
     assert (slope.max(axis=1) <= high * (1 + 1e-4)).all()
 
 
-def test_evaluation_keeps_what_is_done_and_is_json(run, tmp_path):
+def test_evaluation_keeps_what_is_done_and_is_json(tmp_path):
+    study = peg_touch.PegTouchStudy(episodes=32, snapshot_every=16)
+    peg_touch.train("cppo_scaled", [0, 1], out=tmp_path, study=study)
     seen = []
-    options = {"trajectories": 16, "folder": tmp_path, "checkpoints": run.parent}
-    first = peg_touch.evaluate(
-        ["cppo_bounded", "pi"], progress=lambda *a: seen.append(a), **options
-    )
+    options = {"trajectories": 16, "folder": tmp_path / "kept", "checkpoints": tmp_path}
+    options["progress"] = lambda *row: seen.append(row)
+    first = peg_touch.evaluate(["cppo_scaled"], **options)
     json.dumps(first, allow_nan=False)
-    done, total, _ = seen[-1]
-    assert done == total == sum(len(m["tests"]) for m in first["methods"].values())
-    again = peg_touch.evaluate(["cppo_bounded"], **options)
-    assert again["methods"] == first["methods"]
-    certificates = first["methods"]["cppo_bounded"]["certificates"]
-    assert [c["episode"] for c in certificates] == [32, 64]
-    assert all(c["signs"] and all(c["design"]) for c in certificates)
+    found = first["methods"]["cppo_scaled"]
+    assert seen[-1][:2] == (len(found["tests"]),) * 2
+    kept = tmp_path / "kept" / "cppo_scaled.json"
+    half = store.read_json(kept)
+    half["tests"] = half["tests"][:3]
+    half["tests"][0]["return"] = [1.0, 2.0]  # to be recognized: what is there is not repeated
+    store.write_json(kept, half)
+    again = peg_touch.evaluate(["cppo_scaled"], **options)["methods"]["cppo_scaled"]
+    assert again["tests"][0]["return"] == [1.0, 2.0]
+    assert again["tests"][1:] == found["tests"][1:]
+    assert [c["episode"] for c in found["certificates"]] == [16, 32]
+    assert all(c["signs"] and all(c["design"]) for c in found["certificates"])
 
 
 @pytest.mark.parametrize("name", shipped())
