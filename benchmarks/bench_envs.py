@@ -16,7 +16,7 @@ import numpy as np
 
 from cmc.envs.panda_task import PandaTask
 from cmc.envs.peg_maze import JOINT, SOFT, STIFF, PegMaze, PegMazeEnv
-from cmc.envs.peg_push import PUSH, PegPush, PegPushEnv
+from cmc.envs.peg_push import BOX_TOP, PUSH, PegPush, PegPushEnv
 from cmc.robot.panda import LOWER, UPPER
 
 CASES = {"maze": (PegMaze, STIFF), "maze_soft": (PegMaze, SOFT), "push": (PegPush, PUSH)}
@@ -44,6 +44,7 @@ def run() -> Iterator[dict[str, str | float]]:
         yield {"name": f"{name}: 32 worlds against one", "ratio": cost["many"] / cost["one"]}
         yield {"name": f"{name}: control at every step, share", "ratio": raw / cost["every"]}
         yield {"name": f"{name}: same, 32 worlds, share", "ratio": raw / cost["every_many"]}
+    yield _plan()
     for name, (task, config) in {**CASES, "maze_joint": (PegMaze, JOINT)}.items():
         yield {"name": f"{name}: 10^5 random ticks", **_drive(task(config, 32, seed=0))}
 
@@ -69,6 +70,52 @@ def _gym(name: str) -> Callable[[], object]:
     env.reset(seed=0)
     u = np.zeros(env.action_space.shape or (), dtype=np.float32)
     return lambda: env.step(u)
+
+
+PLAN = 1e-3 * np.array([(9.5, 4), (9.5, -3), (-5.1, -3), (3, -3), (3, -12.5), (0, -12.5)])
+
+
+def _plan(ticks: int = 300) -> dict[str, str | float]:
+    """Peg push while it is being solved, contacts included: the same torques, replayed raw."""
+    task = PegPush(PUSH, 1, seed=0)
+    task.reset()
+    start, stage, moves, torques = task.snapshot(), 0, [], []
+    obs = task.set_subgoal(np.zeros((1, 6)))
+    for k in range(ticks):
+        if k % PUSH.horizon == 0:
+            tip = (task.worlds.tip - BOX_TOP)[0]
+            stage = min(stage + int(np.abs(tip[1:] - PLAN[stage]).max() < 7e-4), len(PLAN) - 1)
+            goal = np.array([[-tip[0], *(PLAN[stage] - tip[1:]), 0.0, 0.0, 0.0]])
+            obs = task.set_subgoal(goal)
+        y, integral = (obs[:, task.layout[name]] for name in ("latent", "integral"))
+        u = np.tanh(5.0 * (y + integral))
+        obs = task.step(u)[0]
+        moves.append((goal if k % PUSH.horizon == 0 else None, u))
+        torques.append(task.worlds.data.ctrl.copy())  # type: ignore[attr-defined]
+    model, data = task.worlds.model, mujoco.MjData(task.worlds.model)
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+
+    def whole() -> None:
+        task.restore(start)
+        for goal, u in moves:
+            if goal is not None:
+                task.set_subgoal(goal)
+            task.step(u)
+
+    def raw() -> None:
+        mujoco.mj_setState(model, data, start["physics"][0], kind)
+        for torque in torques:
+            data.ctrl[:] = torque
+            mujoco.mj_step(model, data, 10)
+
+    best = dict.fromkeys((whole, raw), np.inf)
+    for _ in range(REPEATS):
+        for call in best:
+            begin = time.process_time()
+            call()
+            best[call] = min(best[call], time.process_time() - begin)
+    us = 1e6 * best[raw] / ticks
+    return {"name": "push: while solving it", "ratio": best[whole] / best[raw], "raw_us": us}
 
 
 def _best(calls: dict[str, Callable[[], object]]) -> dict[str, float]:

@@ -68,7 +68,7 @@ class PandaTask:
         # mapping_pos: y = K1 e + K2 e', with e' = -velocity because a sub-goal is at rest
         self._to_latent = np.vstack([np.diag(latent.K1), -np.diag(latent.K2)])
         self._sum = np.repeat([config.tick, 0.0], 3)  # the integral acts on translation only
-        self._u_high = np.array(config.u_limit)
+        self._u_high = np.tile(np.array(config.u_limit), (num, 1))
         self._u_low = -self._u_high
         self._action = np.zeros((num, config.low_size))
         self._high_low, self._high_high = (
@@ -85,7 +85,8 @@ class PandaTask:
         self._goal, self.target = self._aims
         self._target_quat = np.zeros((num, 4))
         self.target_rotation, self.target_joints = np.zeros((num, 3)), np.zeros((num, JOINTS))
-        self._ticks = np.zeros(num, dtype=int)
+        self._ticks, self._one = np.zeros(num, dtype=int), np.ones(num, dtype=int)
+        self._tick = np.full(num, config.tick)
         self.layout, self.observation_size = _slices({**self._fields(), "time_to_go": 1})
         self.high_level = (*HIGH_LEVEL, *self._own_fields())
         self._obs = np.zeros((num, self.observation_size))
@@ -212,8 +213,8 @@ class PandaTask:
             # The low-level action may only add to the pull towards the sub-goal (appendix G).
             pull = np.sign(self.target_joints - worlds.qpos[:, :JOINTS])
             worlds.tick_joint(self.target_joints, self.config.joint_stiffness, abs(action) * pull)
-        self._ticks += 1
-        self._left -= self.config.tick
+        self._ticks += self._one
+        self._left -= self._tick
         obs = self._observe(None)
         lengths = self._lengths()
         distance, peaks, tracking = lengths[0], worlds.peaks.copy(), -lengths[1::3]

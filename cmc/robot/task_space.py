@@ -150,8 +150,10 @@ class TaskSpaceController:
         self._dotp, self._dotr = self._jacdot[:3], self._jacdot[3:]
         self.jac, self._jacdot_arm = self._full[:, :JOINTS], self._jacdot[:, :JOINTS]
         self._undriven = self._full[:, JOINTS:] if nv > JOINTS else None
-        self._qn_full, self._mqn_full = np.zeros(nv), np.zeros(nv)
-        self._qn, self._mqn = self._qn_full[:JOINTS], self._mqn_full[:JOINTS]
+        self._transposed = self._full.T
+        # Contiguous arrays of all degrees of freedom multiply faster than slices of seven.
+        self._qn_full, self._tau = np.zeros(nv), np.zeros(nv)
+        self._qn = self._qn_full[:JOINTS]
         self._inverse, self._scratch = np.zeros((6, 6)), np.zeros(JOINTS)
         self._block_trans, self._block_rot = np.zeros((3, 3)), np.zeros((3, 3))
         self._force = np.zeros(6)
@@ -169,7 +171,7 @@ class TaskSpaceController:
         self._data = data
         self._site_pos, self._site_mat = data.site_xpos[self.site], data.site_xmat[self.site]
         self._qpos, self._qvel = data.qpos[:JOINTS], data.qvel[:JOINTS]
-        self._bias, self._passive = data.qfrc_bias[:JOINTS], data.qfrc_passive[:JOINTS]
+        self._qvel_full, self._bias, self._passive = data.qvel, data.qfrc_bias, data.qfrc_passive
 
     def observe(self, data: mujoco.MjData) -> None:
         """Read position, orientation, Jacobian and velocity of the site from the current state."""
@@ -180,7 +182,7 @@ class TaskSpaceController:
             self._undriven.fill(0.0)  # sliders and the peg's mount have no motor
         self.position[:] = self._site_pos
         mujoco.mju_mat2Quat(self.quat, self._site_mat)
-        self.jac.dot(self._qvel, out=self.velocity)
+        self._full.dot(self._qvel_full, out=self.velocity)
 
     def error(self, position: Array, quat: Array) -> Array:
         """Pose error e = (x_d - x, rotation vector from x to x_d in the world frame), (6,).
@@ -231,24 +233,23 @@ class TaskSpaceController:
 
         The site must have been observed in this state.
         """
-        law, model, jac, qn = self.law, self.model, self.jac, self._qn
+        law, model, jac, qn, tau = self.law, self.model, self._full, self._qn, self._tau
         np.subtract(self._posture, self._qpos, out=qn)
         qn *= law.posture_stiffness
         np.multiply(self._qvel, law.posture_damping, out=self._scratch)
         qn -= self._scratch
-        disturbed = jac.dot(qn)  # what the posture would do to the tip
+        disturbed = jac.dot(self._qn_full)  # what the posture would do to the tip
         if law.drift:
             mujoco.mj_jacDot(model, data, self._dotp, self._dotr, self.position, self._body)
             reference = reference - self._jacdot_arm.dot(self._qvel)
         if law.form == "acceleration":
-            qn += self._solve(jac @ jac.T, reference - disturbed).dot(jac)
-            mujoco.mj_mulM(model, data, self._mqn_full, self._qn_full)
-            tau = self._mqn + self._bias  # tau_task_space_control
+            inverse = jac.dot(self._transposed, out=self._inverse)
+            self._qn_full += self._solve(inverse, reference - disturbed).dot(jac)
+            mujoco.mj_mulM(model, data, tau, self._qn_full)  # tau_task_space_control
         else:
-            mujoco.mj_mulM(model, data, self._mqn_full, self._qn_full)
-            mujoco.mj_solveM(model, data, self._solved, self._full)
-            inverse = np.matmul(self._solved, self._full.T, out=self._inverse)  # J M^-1 J^T
-            tau = self._mqn + self._bias
+            mujoco.mj_mulM(model, data, tau, self._qn_full)
+            mujoco.mj_solveM(model, data, self._solved, jac)
+            inverse = self._solved.dot(self._transposed, out=self._inverse)  # J M^-1 J^T
             if law.split:
                 trans, rot, force = self._block_trans, self._block_rot, self._force
                 trans[:], rot[:] = inverse[:3, :3], inverse[3:, 3:]
@@ -259,8 +260,9 @@ class TaskSpaceController:
             else:
                 force = self._solve(inverse, reference - disturbed)
             tau += force.dot(jac)  # Nakanishi 3.3
+        tau += self._bias
         tau -= self._passive  # joint damping is compensated
-        return tau
+        return tau[:JOINTS].copy()
 
     def _solve(self, matrix: Array, right: Array) -> Array:
         """Solve with a positive matrix whose pivots are kept from zero; overwrites it."""
