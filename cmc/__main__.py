@@ -6,13 +6,14 @@ This is the only place where learning and pictures meet.
 from __future__ import annotations
 
 import argparse
+import inspect
 import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from cmc import studies
+from cmc import store, studies
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -39,7 +40,12 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("study")
     train.add_argument("--method", help="one method; all of the study's if left out")
     train.add_argument("--seeds", type=int, default=5, help="number of seeds (default 5)")
-    train.add_argument("--episodes", type=int, help="training episodes, instead of the study's")
+    train.add_argument("--episodes", type=int, help="training episodes (peg_touch)")
+    train.add_argument("--steps", type=int, help="environment steps of each seed (other studies)")
+    train.add_argument("--jobs", type=int, default=1, help="trainings side by side (default 1)")
+    train.add_argument("--group", type=int, help="seeds of one job; all if left out")
+    train.add_argument("--backend", choices=("loky", "dask"), default="loky")
+    train.add_argument("--address", help="of a running Dask scheduler")
     train.add_argument("--out", type=Path, help="folder of the run (default runs/STUDY)")
     train.set_defaults(run=_train)
     evaluate = commands.add_parser("evaluate", help="test the shipped policies")
@@ -47,13 +53,16 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--method", help="one method; all if left out")
     evaluate.add_argument("--trajectories", type=int, help="for each test, instead of the study's")
     evaluate.add_argument("--out", type=Path, help="folder that keeps finished methods")
+    evaluate.add_argument("--checkpoints", type=Path, help="folder; the shipped ones if left out")
+    evaluate.add_argument("--write", type=Path, help="file that also gets all figures, as JSON")
     evaluate.add_argument("--json", action="store_true", help="all figures as the last line")
     evaluate.set_defaults(run=_evaluate)
-    play = commands.add_parser("play", help="write a picture of one trajectory")
+    play = commands.add_parser("play", help="write a picture or a 3D page of one trajectory")
     play.add_argument("study")
     play.add_argument("--method", help="the study's first if left out")
     play.add_argument("--seed", type=int, default=0, help="which trained seed (default 0)")
-    play.add_argument("--out", type=Path, default=Path("play.png"), help="file (default play.png)")
+    play.add_argument("--out", type=Path, help="file (default play.png, or play.html for 3D)")
+    play.add_argument("--checkpoint", type=Path, help="file; the shipped one if left out")
     play.set_defaults(run=_play)
     return parser
 
@@ -74,29 +83,62 @@ def _methods(study: Any, name: str | None) -> list[str]:
     return [name]
 
 
+def _takes(function: Any, name: str) -> bool:
+    """Whether a study's function takes an argument."""
+    return name in inspect.signature(function).parameters
+
+
 def _train(chosen: argparse.Namespace) -> None:
+    study = studies.get(chosen.study)
+    by_steps = _takes(study.train, "steps")
+    unit, other = ("steps", "episodes") if by_steps else ("episodes", "steps")
+    if getattr(chosen, other) is not None:
+        raise ValueError(f"--{other}: {chosen.study} counts {unit}, use --{unit}")
+    amount = {unit: getattr(chosen, unit)}
+    for name, value in {"seeds": chosen.seeds, **amount}.items():
+        if value is not None and value < 1:
+            raise ValueError(f"--{name}: wanted at least 1, got {value}")
+    methods = _methods(study, chosen.method)
+    if chosen.jobs != 1 or chosen.group is not None or chosen.backend != "loky":
+        _sweep(chosen, methods, amount)
+        return
     from tqdm import tqdm
 
-    study = studies.get(chosen.study)
-    if chosen.seeds < 1:
-        raise ValueError(f"--seeds: wanted at least 1, got {chosen.seeds}")
-    if chosen.episodes is not None and chosen.episodes < 1:
-        raise ValueError(f"--episodes: wanted at least 1, got {chosen.episodes}")
-    for method in _methods(study, chosen.method):
+    for method in methods:
         with tqdm(desc=method, unit="update", dynamic_ncols=True) as bar:
 
             def show(report: dict[str, Any], bar: Any = bar) -> None:
-                bar.total = report["total_updates"]
-                bar.set_postfix_str(f"return {report['episode_return'].mean():.1f}", refresh=False)
-                bar.update(report["update"] - bar.n)
+                done, bar.total, text = _progress(report)
+                bar.set_postfix_str(text, refresh=False)
+                bar.update(done - bar.n)
 
-            path = study.train(
-                method,
-                range(chosen.seeds),
-                out=chosen.out,
-                episodes=chosen.episodes,
-                callback=show,
-            )
+            path = study.train(method, range(chosen.seeds), out=chosen.out, callback=show, **amount)
+        print(f"{method}: {path}")
+
+
+def _progress(report: dict[str, Any]) -> tuple[int, int, str]:
+    """How much is done, of how much, and a word about it."""
+    if "update" in report:
+        text = f"return {report['episode_return'].mean():.1f}"
+        return report["update"], report["total_updates"], text
+    return report["steps"], report["total_steps"], f"reward {report['reward'].mean():.4f}"
+
+
+def _sweep(chosen: argparse.Namespace, methods: list[str], amount: dict[str, Any]) -> None:
+    from cmc.studies.sweep import sweep
+
+    paths = sweep(
+        chosen.study,
+        methods,
+        range(chosen.seeds),
+        jobs=chosen.jobs,
+        backend=chosen.backend,
+        group=chosen.group,
+        address=chosen.address,
+        out=chosen.out,
+        **amount,
+    )
+    for method, path in zip(methods, paths, strict=True):
         print(f"{method}: {path}")
 
 
@@ -105,7 +147,8 @@ def _evaluate(chosen: argparse.Namespace) -> None:
 
     study = studies.get(chosen.study)
     names = None if chosen.method is None else _methods(study, chosen.method)
-    options = {} if chosen.out is None else {"folder": chosen.out}
+    given = {"folder": chosen.out, "checkpoints": chosen.checkpoints}
+    options = {name: value for name, value in given.items() if value is not None}
     with tqdm(desc=chosen.study, unit="test", dynamic_ncols=True) as bar:
 
         def show(done: int, total: int, what: str) -> None:
@@ -116,6 +159,8 @@ def _evaluate(chosen: argparse.Namespace) -> None:
         answer = study.evaluate(names, trajectories=chosen.trajectories, progress=show, **options)
     for name, claim in answer["claims"].items():
         print(f"{name}: {claim['verdict']}")
+    if chosen.write is not None:
+        store.write_json(chosen.write, answer)
     if chosen.json:
         print(json.dumps(answer, allow_nan=False))
 
@@ -123,15 +168,48 @@ def _evaluate(chosen: argparse.Namespace) -> None:
 def _play(chosen: argparse.Namespace) -> None:
     study = studies.get(chosen.study)
     method = _methods(study, chosen.method or next(iter(study.METHODS)))[0]
-    if chosen.out.suffix != ".png":
-        raise ValueError(f"--out: wanted a .png file, got {chosen.out}")
-    motion = study.motion(method, chosen.seed)
+    in_space = _takes(study.motion, "path")
+    suffix = ".html" if in_space else ".png"
+    out = chosen.out or Path(f"play{suffix}")
+    if out.suffix != suffix:
+        raise ValueError(f"--out: wanted a {suffix} file, got {out}")
+    if chosen.checkpoint is not None and not in_space:
+        raise ValueError(f"--checkpoint: {chosen.study} plays shipped policies only")
+    options = {} if chosen.checkpoint is None else {"path": chosen.checkpoint}
+    motion = study.motion(method, chosen.seed, **options)
+    print(_page(motion, out) if in_space else _picture(motion, out))
+
+
+def _picture(motion: dict[str, Any], out: Path) -> Any:
+    """Signals over time."""
     from cmc.view import plots
 
     fig, axes = plots.panels(1, len(motion["signals"]), width=9)
     for ax, (label, values, target) in zip(axes.flat, motion["signals"], strict=True):
         plots.trajectories(motion["t"], values, labels=("time (s)", label), target=target, ax=ax)
-    print(plots.save(fig, chosen.out, motion["text"]))
+    return plots.save(fig, out, motion["text"])
+
+
+def _page(motion: dict[str, Any], out: Path) -> Path:
+    """The scene in 3D, with the path of the tip, the sub-goals and the contact force."""
+    import numpy as np
+
+    from cmc.view.playback import Arrow, record
+
+    recording = record(
+        motion["model"],
+        motion["qpos"],
+        motion["t"],
+        title=motion["text"],
+        trails=["tip"],
+        markers=motion["markers"],
+        arrows={"contact force": Arrow(motion["tip"], motion["force"])},
+        readouts={
+            "distance [mm]": 1e3 * motion["distance"],
+            "force [N]": np.linalg.norm(motion["force"], axis=-1),
+        },
+    )
+    return recording.save(out)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from types import ModuleType
 
-STUDIES = ("peg_touch",)
+STUDIES = ("peg_touch", "peg_maze", "peg_maze_stiff", "peg_push")
 """Names under which `get` finds a study; a module of this package each."""
 
 

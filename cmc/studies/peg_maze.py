@@ -25,10 +25,12 @@ What the paper gives is in `cmc.envs.peg_maze` and in the table `tab:my_label`. 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 from cmc.envs.peg_maze import JOINT, SOFT, STIFF, PegMaze
 from cmc.learning.hierarchy import HierarchyConfig
 from cmc.learning.td3 import TD3Config
+from cmc.studies import two_level_motion, two_level_results, two_level_training
 from cmc.studies.two_level import TwoLevelStudy
 
 _CENTER = (0.415, -0.0225, 0.005)
@@ -59,3 +61,10 @@ STUDY = TwoLevelStudy(
     joint_aim=(0.4125, -0.0225, 0.010),
 )
 STIFF_STUDY = replace(STUDY, name="peg_maze_stiff", task=STIFF, joint_task=None)
+
+NAME = STUDY.name
+METHODS = STUDY.methods
+train = partial(two_level_training.train, STUDY)
+evaluate = partial(two_level_results.evaluate, STUDY)
+load = partial(two_level_training.load, STUDY)
+motion = partial(two_level_motion.motion, STUDY)

@@ -9,14 +9,17 @@ What the paper gives is in `cmc.envs.peg_push` and in the table `tab:para`. Devi
    half-range (the table's is below a micrometer); 10,000 steps of random sub-goals come first;
    rewards are means over a segment.
 4. Critics have 128, 128 units.
-5. Low level: as in the maze (`cmc.studies.peg_maze`, 6).
+5. Low level: as in the maze (`cmc.studies.peg_maze`, 6); PPO/Control as there (8).
 """
 
 from __future__ import annotations
 
+from functools import partial
+
 from cmc.envs.peg_push import PUSH, TARGET, PegPush
 from cmc.learning.hierarchy import HierarchyConfig
 from cmc.learning.td3 import TD3Config
+from cmc.studies import two_level_motion, two_level_results, two_level_training
 from cmc.studies.two_level import TwoLevelStudy
 
 STUDY = TwoLevelStudy(
@@ -37,3 +40,10 @@ STUDY = TwoLevelStudy(
     steps=1_000_000,
     snapshot_every=100_000,
 )
+
+NAME = STUDY.name
+METHODS = STUDY.methods
+train = partial(two_level_training.train, STUDY)
+evaluate = partial(two_level_results.evaluate, STUDY)
+load = partial(two_level_training.load, STUDY)
+motion = partial(two_level_motion.motion, STUDY)
