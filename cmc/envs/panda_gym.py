@@ -20,6 +20,9 @@ LowLevel = Callable[[Array, Array], ArrayLike]
 """Low-level policy: y (N, 6) and its integral (N, 6) to u (N, 6)."""
 
 
+_SCALARS = ("contact_force", "contact_force_max", "penetration", "success")
+
+
 class ActionInterface:
     """How one action array becomes sub-goals and low-level actions.
 
@@ -108,13 +111,10 @@ class PandaEnv(gym.Env[Observation, NDArray[np.float32]]):
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One step; see the class for the action."""
         obs, reward, _, truncated, info = self._interface.step(np.asarray(action)[None])
-        flat = {
-            name: {term: float(value[0]) for term, value in entry.items()}
-            if isinstance(entry, dict)
-            else entry[0].item()
-            for name, entry in info.items()
-        }
-        return obs[0].astype(np.float32), float(reward[0]), False, bool(truncated[0]), flat
+        flat: dict[str, Any] = {name: info[name].item() for name in _SCALARS}
+        for group in ("reward_terms", "tracking_terms"):
+            flat[group] = {name: term.item() for name, term in info[group].items()}
+        return obs[0].astype(np.float32), float(reward[0]), False, truncated.item(), flat
 
     def set_subgoal(self, high_action: ArrayLike) -> Observation:
         """Set the sub-goal and observe again; for the action mode "low"."""
