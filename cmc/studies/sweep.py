@@ -7,6 +7,7 @@ was stopped goes on when the same sweep is started again.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -83,13 +84,13 @@ def _run(
 ) -> list[Path]:
     if backend not in ("loky", "dask"):
         raise ValueError(f"backend: wanted 'loky' or 'dask', got {backend!r}")
-    from joblib import Parallel, delayed
+    from joblib import Parallel, delayed, parallel_config
 
     calls = [delayed(_train)(study, name, part, str(where), amount) for name, part, where in wanted]
     if backend == "loky":
         return [Path(path) for path in Parallel(n_jobs=jobs, batch_size=1)(calls)]
-    with _cluster(jobs, address):
-        return [Path(path) for path in Parallel(n_jobs=jobs, backend="dask", batch_size=1)(calls)]
+    with _cluster(jobs, address), parallel_config(backend="dask"):
+        return [Path(path) for path in Parallel(n_jobs=jobs, batch_size=1)(calls)]
 
 
 def _train(study: str, name: str, seeds: list[int], out: str, amount: dict[str, Any]) -> str:
@@ -132,7 +133,11 @@ def merge(paths: Sequence[Path], out: Path) -> Path:
         for key in tensors
     }
     seeds = [seed for _, found in loaded for seed in found["seeds"]]
-    return store.save_checkpoint(out, joined, {**record, "seeds": seeds})
+    command = str(record.get("command", ""))
+    command = re.sub(
+        r"--seeds \d+", f"--seeds {len(seeds)} --group {len(record['seeds'])}", command
+    )
+    return store.save_checkpoint(out, joined, {**record, "seeds": seeds, "command": command})
 
 
 def _seed_axis(key: str) -> int:

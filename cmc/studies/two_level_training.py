@@ -52,7 +52,7 @@ def train(
     folder = Path(out) if out is not None else Path("runs") / study.name
     packed = folder / f"{study.name}_{name}.safetensors"
     state = folder / f"{name}_state.safetensors"
-    record = _record(study, name, seeds)
+    record = _record(study, name, seeds, total)
     kept: dict[str, np.ndarray] = {}
     curve: list[np.ndarray] = []
     if state.is_file() and packed.is_file():
@@ -92,8 +92,9 @@ def _identity(record: dict[str, Any]) -> dict[str, Any]:
     return {key: record[key] for key in ("study", "method", "configuration")}
 
 
-def _record(study: TwoLevelStudy, name: str, seeds: Sequence[int]) -> dict[str, Any]:
+def _record(study: TwoLevelStudy, name: str, seeds: Sequence[int], total: int) -> dict[str, Any]:
     command = f"python -m cmc train {study.name} --method {name} --seeds {len(seeds)}"
+    command += f" --steps {total}"
     settings = asdict(replace(study, steps=0, episodes=0))
     settings["task_class"] = study.task_class.__name__
     made = store.provenance(command, [int(seed) for seed in seeds])
