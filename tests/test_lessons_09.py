@@ -55,6 +55,13 @@ def test_capped_slopes_stay_below_the_bound_of_the_worst_plant():
     assert capped.max() < bounds["faster and stiffer"] < free.max() < bounds["as trained"]
 
 
+def test_gains_on_raw_inputs_creep_to_the_bound():
+    out = lesson_09.raw_gains((5000, 15_000), trajectories=200)
+    assert out["gain"].shape == out["beyond"].shape == (5, 2)
+    assert out["beyond"][:, 1].mean() > out["beyond"][:, 0].mean()
+    assert (out["gain"] < 1.1 * lesson_09.bounds()["as trained"]).all()
+
+
 def test_a_turned_base_needs_the_transforms():
     out = lesson_09.turned_base((0, 120))
     aligned, turned = 0, 1
@@ -70,7 +77,7 @@ def test_tables_have_a_row_for_every_method():
         assert f"| {found['title']} |" in table
     certified = shipped.certificate_table()
     assert certified.count("\n| ") == sum(bool(m["certificates"]) for m in answer.values())
-    assert shipped.claims_table().count("**") == 6
+    assert shipped.claims_table().count("**") == 12
     for sentence in (
         shipped.share_sentence(),
         shipped.agreement_sentence(),

@@ -223,10 +223,16 @@ def test_shipped_results_belong_to_the_shipped_checkpoints():
     np.testing.assert_allclose(fresh["return"], kept["return"], rtol=1e-3)
 
 
-def test_what_the_caps_promise_is_measured_in_the_shipped_results():
-    worst = peg_touch.results()["totals"]["worst"]
-    assert worst["cppo_capped"]["largest_oscillation"] == 0.0
-    for name, found in worst.items():
+def test_what_signs_and_caps_promise_is_measured_in_the_shipped_results():
+    totals = peg_touch.results()["totals"]
+    for name, found in totals["worst"].items():
         if peg_touch.METHODS[name].capped:
-            assert found["largest_drift"] == 0.0, name
-    assert peg_touch.results()["totals"]["agreement"] >= 0.98
+            assert found["largest_oscillation"] == 0.0, name
+    for name in ("cppo", "cppo_capped", "cppo_bounded"):
+        assert totals["worst"][name]["largest_drift"] == 0.0, name
+    assert totals["agreement"] >= 0.98
+    assert totals["agreement_where_some_oscillate"] >= 0.98
+    tests = peg_touch.results()["methods"]["cppo_capped"]["tests"]
+    full = [t for t in tests if t["h"] == 0.01]
+    assert len(full) == 15 * len(peg_touch.SHIFTS)
+    assert all(t["trajectories"] == 8000 and len(t["oscillation"]) == 5 for t in full)

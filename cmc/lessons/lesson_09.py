@@ -108,6 +108,37 @@ def bounds() -> dict[str, float]:
     return {"as trained": float(values[0]), "faster and stiffer": float(values[1])}
 
 
+def raw_gains(
+    episodes: Sequence[int] = (5000, 7500, 10_000, 12_500, 15_000), trajectories: int = 300
+) -> dict[str, Array]:
+    """K |d a_2 / d f| of PPO on raw inputs where its trajectories come to rest.
+
+    Without an integral the force loop is k1 alone, so the bound on it is that of `bounds`.
+
+    Returns:
+        `episode` (E,), `gain`: its 95 % quantile, and `beyond`: the share of trajectories above
+        the bound, (seeds, E) each.
+    """
+    task, bound = peg_touch.task_of("ppo_raw"), bounds()["as trained"]
+    seeds = len(peg_touch.contents("ppo_raw")[1]["seeds"])
+    test = peg_touch.TestConfig(trajectories=trajectories)
+    kept = [1000 * round(episode / 1000) for episode in episodes]
+    gains, beyond = [], []
+    for episode in kept:
+        policy = peg_touch.load("ppo_raw", episode)
+        run = record(policy, task, test, seeds)
+        mean = torch.as_tensor(run.mean_s, dtype=torch.float32).flatten(-2).requires_grad_(True)
+        slope = torch.autograd.grad(policy(mean)[..., 1].sum(), mean)[0][..., 1].numpy()
+        gain = -slope * run.envs.sampled["K_sur"].reshape(seeds, trajectories)
+        gains.append(np.quantile(gain, 0.95, axis=1))
+        beyond.append(np.mean(gain > bound, axis=1))
+    return {
+        "episode": np.array(kept, float),
+        "gain": np.array(gains).T,
+        "beyond": np.array(beyond).T,
+    }
+
+
 @lru_cache(maxsize=64)
 def _policy(method: str, episode: int, seed: int) -> nn.Module:
     return peg_touch.load(method, episode, seed=seed)

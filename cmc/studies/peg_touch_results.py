@@ -153,7 +153,8 @@ def evaluate_method(
     shown = paper_mark([test["episode"] for test in tests]) if arm.trained else None
     for test_of in tests:  # histograms are shown for one episode; the others only take room
         if test_of["episode"] != shown or test_of["h"] != PegTouchStudy().task.h:
-            test_of.pop("histogram_x", None), test_of.pop("histogram_f", None)
+            test_of.pop("histogram_f", None)
+        test_of.pop("histogram_x", None)
     kept = {"tests": tests, "certificates": certified}
     return {"title": arm.title, "seeds": seeds, "training": training, **kept}
 
