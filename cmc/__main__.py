@@ -104,8 +104,9 @@ def _train(chosen: argparse.Namespace) -> None:
         return
     from tqdm import tqdm
 
+    counted = "step" if by_steps else "update"
     for method in methods:
-        with tqdm(desc=method, unit="update", dynamic_ncols=True) as bar:
+        with tqdm(desc=method, unit=counted, dynamic_ncols=True) as bar:
 
             def show(report: dict[str, Any], bar: Any = bar) -> None:
                 done, bar.total, text = _progress(report)

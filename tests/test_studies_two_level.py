@@ -14,7 +14,7 @@ import pytest
 
 from cmc import store
 from cmc.learning.hierarchy import HierarchyConfig
-from cmc.studies import peg_maze, peg_push, two_level, two_level_evaluation
+from cmc.studies import peg_maze, peg_push, two_level, two_level_evaluation, two_level_results
 from cmc.studies.two_level_training import load, marks, train
 
 SMALL = HierarchyConfig(worlds=2, samples=80, high_updates=4, low_updates=4, warm_up=80)
@@ -142,3 +142,34 @@ def test_constrained_slopes_stay_below_the_cap_while_learning(tmp_path: Path) ->
     slopes = two_level_evaluation.slope_at_rest(study, low, seeds=2)
     assert (slopes > 0).all()
     assert (slopes <= study.slope_cap() * (1 + 1e-4)).all()
+
+
+@pytest.mark.parametrize("name", ["control", "hiro"])
+def test_figures_by_kept_policy_go_on_where_they_stopped(name: str, tmp_path: Path) -> None:
+    study = small(peg_maze.STUDY)
+    train(study, name, [0, 1], steps=240, out=tmp_path)
+    seen: list[str] = []
+
+    def stop(done: int, total: int, what: str) -> None:
+        seen.append(what)
+        if done == 1 and len(seen) == 2:
+            raise KeyboardInterrupt
+
+    options = {"trajectories": 10, "folder": tmp_path / "tests", "checkpoints": tmp_path}
+    with pytest.raises(KeyboardInterrupt):
+        two_level_results.evaluate(study, [name], progress=stop, **options)
+    kept = store.read_json(tmp_path / "tests" / f"{name}.json")["tests"]
+    answer = two_level_results.evaluate(study, **options)
+    assert list(answer["methods"]) == [name]
+    found = answer["methods"][name]
+    assert [test["episodes"] for test in found["tests"]] == [2, 10]
+    assert found["tests"][:1] == kept
+    assert "gains" not in found["final"]
+    assert len(found["training"]["step"]) == len(found["training"]["reward"])
+    mean = np.mean([test["force"]["largest"]["zero"] for test in found["tests"]])
+    assert found["force_over_tests"]["largest"]["zero"] == pytest.approx(mean)
+    part = np.array(found["final"]["consistency_mm"]["mean"]) / 5.0
+    if name == "control":  # without action the gains alone decide, whatever was learned
+        assert part[0] == pytest.approx(part[1], rel=0.02)
+        assert 0.2 < part[0] < 0.8
+    assert np.isfinite(part).all()

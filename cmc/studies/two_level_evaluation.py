@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -126,13 +126,15 @@ def consistency(
 ) -> dict[str, Array]:
     """Spread of the tip's displacement over one segment, for one sub-goal and many starts.
 
-    Every world starts an episode anew, is moved by a random sub-goal for one segment (so that it
-    starts the next one in motion), and is then asked for a 5 mm step in x.
+    In free space (the task without its obstacles) every world starts an episode anew, is moved by a
+    random sub-goal for one segment, so that it starts the next one elsewhere and in motion, and is
+    then asked for a step of 5 mm along -x.
 
     Returns:
-        `mean` and `spread` (standard deviation over starts) of the displacement along the step,
-        per seed, (seeds,), m.
+        `mean`, the displacement along the step, and `spread`, the root of the summed variances of
+        the displacement over starts, per seed, (seeds,), m.
     """
+    study = replace(study, task=replace(study.task, scene="panda.xml"))
     task = study.task_class(study.task, num=seeds * starts, seed=TEST_SEED + 1)
     rng = np.random.default_rng(TEST_SEED)
     low_end, high_end = np.array(study.task.subgoal_low), np.array(study.task.subgoal_high)
@@ -141,10 +143,11 @@ def consistency(
     obs = task.set_subgoal(np.tile(first, (seeds, 1)))
     _ticks(task, low, obs, seeds, study)
     before = task.worlds.tip.copy()
-    obs = task.set_subgoal(_step_in_x(task, study, 0.005))
+    obs = task.set_subgoal(_step_in_x(task, study, -0.005))
     _ticks(task, low, obs, seeds, study)
-    moved = (task.worlds.tip - before)[:, 0].reshape(seeds, starts)
-    return {"mean": moved.mean(1), "spread": moved.std(1)}
+    moved = (task.worlds.tip - before).reshape(seeds, starts, 3)
+    spread = np.sqrt(moved.var(1).sum(-1))
+    return {"mean": -moved[..., 0].mean(1), "spread": spread}
 
 
 def _step_in_x(task: Any, study: TwoLevelStudy, length: float) -> Array:
