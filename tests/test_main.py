@@ -23,9 +23,11 @@ def test_train_writes_a_checkpoint_and_goes_on(tmp_path, capsys):
 
 def test_evaluate_ends_with_one_json_object(tmp_path, capsys):
     request = ["evaluate", "peg_touch", "--method", "pi", "--trajectories", "8", "--json"]
-    assert main([*request, "--out", str(tmp_path)]) == 0
+    copy = tmp_path / "copy.json"
+    assert main([*request, "--out", str(tmp_path), "--write", str(copy)]) == 0
     answer = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert answer["methods"]["pi"]["tests"]
+    assert json.loads(copy.read_text()) == answer
 
 
 def test_play_writes_a_picture(tmp_path):

@@ -12,6 +12,8 @@ from cmc.studies import peg_touch
 from cmc.studies.peg_touch_evaluation import ERROR_BINS
 
 Array = NDArray[np.float64]
+EDGES: Array = np.log10(ERROR_BINS)
+"""Edges of the stored error histograms, log10 of m or N."""
 
 
 @cache
@@ -50,8 +52,7 @@ def over_training(key: str, names: tuple[str, ...]) -> dict[str, tuple[Array, Ar
 def errors(name: str, shift: str, episode: int | None = 5000) -> Array:
     """log10 of the mean force error of each test's last second, from the stored histogram."""
     counts = np.array(peg_touch.at(methods()[name], episode, shift=shift)["histogram_f"])
-    edges = np.log10(ERROR_BINS)
-    return np.repeat(0.5 * (edges[1:] + edges[:-1]), counts)
+    return np.repeat(0.5 * (EDGES[1:] + EDGES[:-1]), counts)
 
 
 def predictions() -> tuple[Array, Array]:
