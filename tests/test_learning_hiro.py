@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from cmc.envs.peg_maze import JOINT, PegMaze
+from cmc.envs.peg_maze import GOAL_HIGH, GOAL_LOW, JOINT, PegMaze
 from cmc.learning.hierarchy import low_fields, rollout
 from cmc.learning.hiro import (
     CANDIDATES,
@@ -25,6 +25,8 @@ from cmc.learning.hiro import (
 from cmc.learning.low_level import Segment, evaluate
 from cmc.learning.replay import Batch
 from cmc.learning.td3 import TD3, TD3Config
+from cmc.robot.panda import FINGERTIP, forward_kinematics
+from cmc.studies import peg_maze
 
 N, T = 2, 5
 FREE = (torch.full((N,), -9.0), torch.full((N,), 9.0))
@@ -193,3 +195,16 @@ def test_a_frozen_actor_answers_as_the_learner_without_noise() -> None:
     found = evaluate(Normalised(low.agent.actor, low.units), seen)
     np.testing.assert_allclose(found, expected, atol=1e-5)
     assert np.abs(found).max() > 0.0
+
+
+def test_the_first_random_sub_goals_lie_around_the_maze() -> None:
+    """Their middle moves the joints to a pose with the tip among the goals."""
+    study = peg_maze.STUDY.of("hiro")
+    planning, task = study.planning(), PegMaze(study.task, num=3, seed=0)
+    obs = task.reset()
+    task.set_subgoal(planning.subgoal(planning.direction(task, obs)))
+    np.testing.assert_allclose(task.target_joints, np.tile(planning.aim, (3, 1)), atol=1e-9)
+    tip, _ = forward_kinematics(planning.aim, tool=FINGERTIP + study.task.peg.length)
+    assert (tip >= GOAL_LOW).all()
+    assert (tip <= GOAL_HIGH).all()
+    assert not peg_maze.STUDY.planning().direction(task, obs).any()
