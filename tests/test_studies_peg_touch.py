@@ -207,6 +207,15 @@ def test_shipped_checkpoints_are_complete(name):
     assert sidecar["configuration"] == found["configuration"]
 
 
+@pytest.mark.parametrize("name", ["cppo", "ppo", "cppo_bounded"])
+def test_shipped_runs_begin_as_the_present_code_does(name, tmp_path):
+    """The first updates of one seed, trained again alone, are those of the shipped five."""
+    path = peg_touch.train(name, [0], episodes=32, out=tmp_path)
+    _, found = peg_touch.learning_curve(name, path)
+    _, wanted = peg_touch.learning_curve(name)
+    np.testing.assert_allclose(found[:2, 0], wanted[:2, 0], rtol=1e-3)
+
+
 def test_shipped_results_belong_to_the_shipped_checkpoints():
     answer = peg_touch.results()
     assert set(answer["methods"]) == {*shipped(), "pi", "pi_scaled"}
