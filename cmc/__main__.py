@@ -10,6 +10,7 @@ import inspect
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -210,7 +211,9 @@ def _page(motion: dict[str, Any], out: Path) -> Path:
             "force [N]": np.linalg.norm(motion["force"], axis=-1),
         },
     )
-    return recording.save(out)
+    views = dict(recording.cameras)
+    near = {"task": views.pop("task")} if "task" in views else {}
+    return replace(recording, cameras=near | views).save(out)
 
 
 if __name__ == "__main__":

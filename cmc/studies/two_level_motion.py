@@ -68,15 +68,16 @@ def motion(
     markers = {"goal": goal}
     if study.task.command == "pose":
         markers["sub-goal"] = target
-    end = "reaches the goal" if success else "does not reach the goal"
+    distance = np.linalg.norm(goal - tip, axis=-1)
+    end = f"ends {1e3 * distance[-1]:.1f} mm from the goal"
     return {
         "model": task.worlds.model,
         "t": study.task.tick * np.arange(len(tip)),
         "qpos": qpos,
         "tip": tip,
         "force": force,
-        "distance": np.linalg.norm(goal - tip, axis=-1),
+        "distance": distance,
         "markers": markers,
         "success": success,
-        "text": f"{study.name}, {title}, seed {record['seeds'][seed]}: the peg {end}",
+        "text": f"{study.name}, {title}, seed {record['seeds'][seed]}: the tip {end}",
     }
