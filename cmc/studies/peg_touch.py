@@ -14,9 +14,10 @@ shape. What it leaves open is chosen here, and everything that differs from it i
 7. Oscillation and drift are not defined in the paper; `cmc.studies.detectors` defines them. Tests
    last 2 s with a deterministic policy, training episodes 0.5 s.
 8. Arms that the paper has not: joint and raw inputs, identity transforms, no integral, slopes
-   capped by the sampled-data bound (for half the lag and twice the stiffness), a cap on the loop
-   gain with the nominal stiffness divided out, slopes bounded on both sides, gradients of convex
-   networks (arXiv 2305.17777), hand-tuned PI, and a labeled stress setting of PPO.
+   capped by the sampled-data bound (for half the lag and twice the stiffness), the same with most
+   of the vertical room in a linear bypass, a cap on the loop gain with the nominal stiffness
+   divided out, slopes bounded on both sides, gradients of convex networks (arXiv 2305.17777),
+   hand-tuned PI, and a labeled stress setting of PPO.
 """
 
 from __future__ import annotations

@@ -160,6 +160,13 @@ def _bounded(seeds: Seeds, limit: np.ndarray, h: float) -> nn.Module:
     return TouchPolicy(net)
 
 
+def _bypass(seeds: Seeds, limit: np.ndarray, h: float) -> nn.Module:
+    cap = ((1.0, h / 2), SAFETY * limit)
+    floor = np.stack([limit, limit / (h / 2)], axis=-1) * BYPASS
+    net = PositiveNetwork(2, hidden=HIDDEN, seeds=seeds, joint_cap=cap, slope_min=floor)
+    return TouchPolicy(net)
+
+
 def _no_integral(seeds: Seeds, limit: np.ndarray, h: float) -> nn.Module:
     return TouchPolicy(PositiveNetwork(2, hidden=HIDDEN, seeds=seeds), integral=False)
 
@@ -180,12 +187,17 @@ SAFETY = 0.98
 """Share of the sampled-data limit that a cap leaves to the policy: our choice."""
 FLOOR = 0.05
 """Share of the limit below which `cppo_bounded` holds no slope (half of it each): our choice."""
+BYPASS = np.array([[0.0, 0.0], [0.15, 0.6]])
+"""Shares of the limit that `cppo_bypass` puts into a linear bypass, vertically: our choice."""
 
 
 METHODS: dict[str, Method] = {
     "cppo": Method("C-PPO", "auxiliary", _cppo, contracting=True),
     "ppo": Method("PPO, one network per dimension", "auxiliary", _ppo),
     "cppo_capped": Method("C-PPO, capped", "auxiliary", _capped, contracting=True, capped=True),
+    "cppo_bypass": Method(
+        "C-PPO, capped, vertical bypass", "auxiliary", _bypass, contracting=True, capped=True
+    ),
     "cppo_scaled": Method(
         "C-PPO, capped loop gain", "auxiliary", _capped, contracting=True, capped=True, scaled=True
     ),

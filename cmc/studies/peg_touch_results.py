@@ -34,13 +34,22 @@ SIDE = 2000
 """Trajectories for each seed where the paper makes no statement: side arms, control periods."""
 SAMPLE_TIMES = (0.002, 0.005, 0.01, 0.02, 0.03)
 """Control periods of the test of the sampled-data bound [s]; training has 0.01."""
-DENSE = ("cppo", "ppo", "cppo_capped", "ppo_stress", "cppo_stress", "ppo_joint", "ppo_raw")
+DENSE = (
+    "cppo",
+    "ppo",
+    "cppo_capped",
+    "cppo_bypass",
+    "ppo_stress",
+    "cppo_stress",
+    "ppo_joint",
+    "ppo_raw",
+)
 """Methods tested at every kept policy; the others at `SPARSE`."""
-TIMED = ("cppo", "ppo", "cppo_capped", "cppo_bounded")
+TIMED = ("cppo", "ppo", "cppo_capped", "cppo_bypass", "cppo_bounded")
 """Methods tested with other control periods."""
-EVERY_SHIFT = ("cppo_capped",)
+EVERY_SHIFT = ("cppo_capped", "cppo_bypass")
 """Methods tested under every shift at every kept policy."""
-FULL = ("cppo", "ppo", "cppo_capped", "cppo_bounded")
+FULL = ("cppo", "ppo", "cppo_capped", "cppo_bypass", "cppo_bounded")
 """Methods tested with all trajectories, the others with `SIDE`."""
 
 
