@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 from cmc import store
 from cmc.learning.hierarchy import HierarchyConfig
@@ -173,3 +174,13 @@ def test_figures_by_kept_policy_go_on_where_they_stopped(name: str, tmp_path: Pa
         assert part[0] == pytest.approx(part[1], rel=0.02)
         assert 0.2 < part[0] < 0.8
     assert np.isfinite(part).all()
+
+
+@pytest.mark.parametrize(("hits", "tries"), [(0, 10), (3, 10), (10, 10), (490, 500)])
+def test_the_ends_of_an_interval_leave_a_fortieth_on_each_side(hits: int, tries: int) -> None:
+    low, high = two_level_evaluation.interval(hits, tries)
+    assert 0.0 <= low <= hits / tries <= high <= 1.0
+    if hits:
+        assert binom.sf(hits - 1, tries, low) == pytest.approx(0.025)
+    if hits < tries:
+        assert binom.cdf(hits, tries, high) == pytest.approx(0.025)

@@ -88,9 +88,9 @@ def _run(
 
     calls = [delayed(_train)(study, name, part, str(where), amount) for name, part, where in wanted]
     if backend == "loky":
-        return [Path(path) for path in Parallel(n_jobs=jobs, batch_size=1)(calls)]
+        return [Path(path) for path in Parallel(n_jobs=jobs, batch_size=1, verbose=5)(calls)]
     with _cluster(jobs, address), parallel_config(backend="dask"):
-        return [Path(path) for path in Parallel(n_jobs=jobs, batch_size=1)(calls)]
+        return [Path(path) for path in Parallel(n_jobs=jobs, batch_size=1, verbose=5)(calls)]
 
 
 def _train(study: str, name: str, seeds: list[int], out: str, amount: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import beta
+from scipy.special import betaincinv
 from torch import nn
 
 from cmc.learning.hierarchy import low_fields
@@ -116,8 +116,8 @@ def summary(found: Episodes) -> dict[str, Any]:
 def interval(hits: int, tries: int, level: float = 0.95) -> list[float]:
     """Clopper-Pearson interval of a share; exact, and blind to differences between seeds."""
     tail = (1 - level) / 2
-    low = beta.ppf(tail, hits, tries - hits + 1) if hits else 0.0
-    high = beta.ppf(1 - tail, hits + 1, tries - hits) if hits < tries else 1.0
+    low = betaincinv(hits, tries - hits + 1, tail) if hits else 0.0
+    high = betaincinv(hits + 1, tries - hits, 1 - tail) if hits < tries else 1.0
     return [float(low), float(high)]
 
 
