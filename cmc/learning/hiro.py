@@ -200,17 +200,20 @@ class OffPolicyCorrection:
 
     def relabel(self, batch: Batch) -> Batch:
         """The sample with each sub-goal replaced by its likeliest candidate."""
+        goals, score = self.scored(batch)
+        best = score.argmax(-1)[..., None, None].expand(-1, -1, 1, self.n)
+        return replace(batch, action=goals.gather(2, best)[:, :, 0])
+
+    def scored(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Candidates (seeds, batch, 10, n) for a sample, and their log-likelihoods."""
         rows = batch.extra[..., : -self.n].unflatten(-1, (self.horizon, 3 * self.n))
-        last = batch.extra[..., -self.n :]
-        moved = last - rows[..., 0, : self.n]
+        moved = batch.extra[..., -self.n :] - rows[..., 0, : self.n]
         shape = (moved.shape[1], CANDIDATES - 2, self.n)
         noise = np.stack([g.standard_normal(shape, dtype=np.float32) for g in self._generators])
         goals = candidates(batch.action, moved, torch.from_numpy(noise))
         states, speeds, actions = rows[..., :: self.stride, :].chunk(3, dim=-1)
         actor = self.low.agent.actor
-        score = log_likelihood(actor, states, speeds, actions, goals, self._reach)
-        best = score.argmax(-1)[..., None, None].expand(-1, -1, 1, self.n)
-        return replace(batch, action=goals.gather(2, best)[:, :, 0])
+        return goals, log_likelihood(actor, states, speeds, actions, goals, self._reach)
 
     def state(self) -> list[Any]:
         """The generators' states."""
