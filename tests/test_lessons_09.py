@@ -82,6 +82,7 @@ def test_tables_have_a_row_for_every_method():
         shipped.share_sentence(),
         shipped.agreement_sentence(),
         shipped.cap_sentence(),
+        shipped.caps_table(),
     ):
         assert "nan" not in sentence
 

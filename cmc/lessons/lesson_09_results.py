@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cmc import store
 from cmc.studies import peg_touch
 from cmc.studies.peg_touch_evaluation import ERROR_BINS
 
@@ -90,18 +91,36 @@ def share_sentence() -> str:
 
 
 def cap_sentence() -> str:
-    """Markdown: what the cap costs in return."""
-    free, capped = methods()["cppo"], methods()["cppo_capped"]
-    parts = []
-    for mark in (5000, 15_000):
-        a, b = (np.mean(peg_touch.at(m, mark)["return"]) for m in (free, capped))
-        parts.append(f"{b:.2f} against {a:.2f} ({(b - a) / abs(a):+.0%}) at episode {mark:,}")
-    worst = peg_touch.results()["totals"]["worst"]["cppo_capped"]
-    return (
-        f"Return with and without the cap: {' and '.join(parts)}. In {worst['tests']} tests of the "
-        f"capped policies, at every kept episode and under every shift, the largest share that "
-        f"oscillates is {worst['largest_oscillation']:.1%} and that drifts "
-        f"{worst['largest_drift']:.1%}."
+    """Markdown: what the caps cost in return."""
+    free = methods()["cppo"]
+    costs = []
+    for name in ("cppo_capped", "cppo_bypass"):
+        parts = []
+        for mark in (5000, 15_000):
+            a, b = (np.mean(peg_touch.at(m, mark)["return"]) for m in (free, methods()[name]))
+            parts.append(f"{b:.2f} against {a:.2f} ({(b - a) / abs(a):+.0%}) at episode {mark:,}")
+        worst = peg_touch.results()["totals"]["worst"][name]
+        costs.append(
+            f"**{methods()[name]['title']}**: return {' and '.join(parts)}; in "
+            f"{worst['tests']} tests, at every kept episode and under every shift, the largest "
+            f"share that oscillates is {worst['largest_oscillation']:.1%} and that drifts "
+            f"{worst['largest_drift']:.1%}."
+        )
+    return "\n\n".join(costs)
+
+
+def caps_table() -> str:
+    """Markdown: every cap that was tried, its cost in return and its worst share."""
+    found = store.read_json(store.asset("results", "peg_touch_caps.json"))
+    head = (
+        "| cap | return, mean [lowest, highest seed] | cost | largest oscillation over shifts |\n"
+        "|---|---|---|---|\n"
+    )
+    rows = sorted(found["variants"].values(), key=lambda v: -float(np.mean(v["return"])))
+    return head + "\n".join(
+        f"| {v['title']} | {_range(v['return'])} | {v['cost']:+.0%} "
+        f"| {max(v['oscillation'].values()):.0%} |"
+        for v in rows
     )
 
 
