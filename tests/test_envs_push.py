@@ -158,3 +158,16 @@ def test_standing_on_the_obstacle_is_no_success():
     assert not info["success"].any()
     task = place(np.array([0, 0, -12.5]) * MM, -11.9 * MM, (0.0, -2.0 * MM))
     assert task.step(np.zeros((1, 6)))[4]["success"].all()
+
+
+def test_the_logged_force_is_what_the_world_does_to_the_peg():
+    """Pressed down on the lid, the peg is pushed up, in one world and in many alike."""
+    one = place(np.array([0.0, 0.0, 0.003]), 0.0)
+    many = PegPush(PUSH, 2, seed=0)
+    many.worlds.reset(np.repeat(one.worlds.qpos, 2, axis=0), np.array([True, True]))
+    for task in (one, many):
+        for k in range(30):
+            if k % PUSH.horizon == 0:
+                task.set_subgoal(np.tile([0, 0, -0.005, 0, 0, 0], (task.num, 1)))
+            task.step(np.tile([0, 0, -1.0, 0, 0, 0], (task.num, 1)))
+        assert (task.worlds.force[:, 2] > 1.0).all()

@@ -158,7 +158,7 @@ class OneWorld:
 
     def _finish(self) -> None:
         mujoco.mj_step1(self.model, self.data)
-        self.force[0] = self._last_force
+        np.negative(self._last_force, out=self.force[0])  # the sensor: the peg's push
         if self._every_force.dot(self._every_force) > 0.0:
             squares = np.vecdot(self._forces, self._forces)
             self.peaks[0] = float(squares.max()) ** 0.5
@@ -255,7 +255,7 @@ class ManyWorlds:
             self._ctrl[:] = torque()
             self.batch.step(nstep=every, stage=mujoco.mjtStage.mjSTAGE_VEL)
             self._observe()
-        self.force[:] = self._last_force
+        np.negative(self._last_force, out=self.force)  # the sensor: the peg's push
         self.peaks[0] = np.sqrt(np.vecdot(self._forces, self._forces).max(-1))
         self.peaks[1] = np.maximum(0.0, -self._distances.min(-1))
 
