@@ -98,7 +98,9 @@ def cap_sentence() -> str:
         parts = []
         for mark in (5000, 15_000):
             a, b = (np.mean(peg_touch.at(m, mark)["return"]) for m in (free, methods()[name]))
-            parts.append(f"{b:.2f} against {a:.2f} ({(b - a) / abs(a):+.0%}) at episode {mark:,}")
+            change = (b - a) / abs(a)
+            word = "better" if change > 0 else "worse"
+            parts.append(f"{b:.2f} against {a:.2f} ({abs(change):.0%} {word}) at episode {mark:,}")
         worst = peg_touch.results()["totals"]["worst"][name]
         costs.append(
             f"**{methods()[name]['title']}**: return {' and '.join(parts)}; in "
