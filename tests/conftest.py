@@ -1,4 +1,4 @@
-"""One headless Chromium for all browser tests of a run."""
+"""One headless Chromium for the browser tests of a file."""
 
 from __future__ import annotations
 
@@ -12,9 +12,13 @@ import pytest
 from find_browser import MISSING, find_browser
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser():
-    """A headless Chromium; without one the test is skipped, or fails if a browser is required."""
+    """A headless Chromium; without one the test is skipped, or fails if a browser is required.
+
+    It closes with the file: while Playwright runs, an event loop runs in this thread, and tests
+    elsewhere that need a loop of their own would fail.
+    """
     required = os.environ.get("CMC_REQUIRE_BROWSER", "0") not in ("", "0")
     absent = pytest.fail if required else pytest.skip
     try:
