@@ -200,7 +200,7 @@ def turned_base(
     """
     test = peg_touch.TestConfig(trajectories=budget(400, 100), sign_every=10_000)
     answer: dict[str, Any] = {"angle": np.asarray(angles, dtype=float)}
-    for method in ("cppo_bounded", "cppo_identity"):
+    for method in ("cppo", "cppo_identity"):
         missed = []
         for angle in angles:
             task = peg_touch.task_of(method)
