@@ -136,7 +136,7 @@ def null_space(form: Form, posture: bool, seconds: float | None = None) -> dict[
 
 
 def posture_torques() -> dict[str, Array]:
-    """Acceleration of the tip (3,), m/s^2, that a posture torque causes, by way of doing it.
+    """Acceleration of the tip (3,), m/s^2, that a posture torque causes, by how it enters.
 
     The same posture acceleration q_n'' = q_0 - q enters with the inertia and the dynamically
     consistent projector, without the inertia, and without any projector.
