@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from cmc.envs.peg_maze import SOFT
 from cmc.fast import budget
 from cmc.lessons.panda_bench import (
     START,
@@ -51,8 +52,8 @@ WAYPOINTS = np.array(
     ]
 )
 """A way through the maze, m."""
-SPRING = Peg(stiffness=200.0, damping=8.0)
-"""The compliant peg: two lateral springs of 200 N/m."""
+SPRING = SOFT.peg
+"""The compliant peg of the soft maze: two lateral springs."""
 
 
 def kinematics_check(number: int = 200) -> dict[str, float]:
@@ -227,7 +228,9 @@ def impacts(number: int | None = None) -> dict[str, Array]:
     result = {name: np.array(values) for name, values in out.items()}
     slope = float(result["rigid"] @ result["speed"] / (result["speed"] @ result["speed"]))
     spring = np.sqrt(SPRING.stiffness * mass) * result["speed"]
-    return result | {"mass": np.array(mass), "slope": np.array(slope), "spring_model": spring}
+    constants = {"mass": mass, "slope": slope, "stiffness": SPRING.stiffness}
+    numbers = {name: np.array(value) for name, value in constants.items()}
+    return result | numbers | {"spring_model": spring}
 
 
 def response(K_p: float, K_d: float, gain: float, dx: float, dz: float) -> dict[str, Any]:
