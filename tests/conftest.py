@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 
 # One thread a process: numpy and torch read this when they are imported, and small matrices lose by
 # more of them, badly so when the tests run side by side.
@@ -35,3 +36,10 @@ def browser():
         running = playwright.chromium.launch(executable_path=path, args=arguments)
         yield running
         running.close()
+
+
+@pytest.fixture(autouse=True)
+def same_draws():
+    """Start torch's generator anew for each test, so that its draws depend on no other test."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].manual_seed(0)

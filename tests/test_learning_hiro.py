@@ -172,14 +172,16 @@ def test_relabelling_never_makes_the_actions_less_likely_and_resumes() -> None:
     task, low = joint_low(seeds)
     correction = OffPolicyCorrection(low, seeds, T)
     segment = run_segment(task, low, 2)
-    batch = batch_of(correction, segment, torch.rand(2, 2, 7) * 2 - 1)
+    drawn = torch.rand(2, 2, 7, generator=torch.Generator().manual_seed(3))
+    batch = batch_of(correction, segment, drawn * 2 - 1)
     saved = correction.state()
     found = correction.relabel(batch)
     rows = batch.extra[..., :-7].unflatten(-1, (T, 21))
     parts = rows.chunk(3, dim=-1)
     both = torch.stack([batch.action, found.action], dim=2)
     score = log_likelihood(low.agent.actor, *parts, both, correction._reach)
-    assert (score[..., 1] >= score[..., 0]).all()
+    kept = (found.action == batch.action).all(-1)  # equal scores may differ by rounding
+    assert ((score[..., 1] > score[..., 0]) | kept).all()
     correction.restore(saved)
     torch.testing.assert_close(correction.relabel(batch).action, found.action)
     with pytest.raises(ValueError, match="stride: wanted 1 to 5"):
