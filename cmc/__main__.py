@@ -62,7 +62,10 @@ def _parser() -> argparse.ArgumentParser:
     play.add_argument("study")
     play.add_argument("--method", help="the study's first if left out")
     play.add_argument("--seed", type=int, default=0, help="which trained seed (default 0)")
-    play.add_argument("--out", type=Path, help="file (default play.png, or play.html for 3D)")
+    play.add_argument("--episode", type=int, default=0, help="number of the test start (3D)")
+    play.add_argument(
+        "--out", type=Path, help="file (default play.png, or play.html for 3D; .npz keeps arrays)"
+    )
     play.add_argument("--checkpoint", type=Path, help="file; the shipped one if left out")
     play.set_defaults(run=_play)
     return parser
@@ -171,15 +174,26 @@ def _play(chosen: argparse.Namespace) -> None:
     study = studies.get(chosen.study)
     method = _methods(study, chosen.method or next(iter(study.METHODS)))[0]
     in_space = _takes(study.motion, "path")
-    suffix = ".html" if in_space else ".png"
-    out = chosen.out or Path(f"play{suffix}")
-    if out.suffix != suffix:
-        raise ValueError(f"--out: wanted a {suffix} file, got {out}")
+    wanted = (".html", ".npz") if in_space else (".png",)
+    out = chosen.out or Path(f"play{wanted[0]}")
+    if out.suffix not in wanted:
+        raise ValueError(f"--out: wanted a {' or '.join(wanted)} file, got {out}")
     if chosen.checkpoint is not None and not in_space:
         raise ValueError(f"--checkpoint: {chosen.study} plays shipped policies only")
-    options = {} if chosen.checkpoint is None else {"path": chosen.checkpoint}
-    motion = study.motion(method, chosen.seed, **options)
-    print(_page(motion, out) if in_space else _picture(motion, out))
+    if not in_space:
+        print(_picture(study.motion(method, chosen.seed), out))
+        return
+    path = chosen.checkpoint
+    motion = study.motion(method, chosen.seed, episode=chosen.episode, path=path)
+    if out.suffix == ".html":
+        print(_page(motion, out))
+        return
+    from cmc.studies import recorded
+
+    command = f"python -m cmc play {chosen.study} --method {method} --seed {chosen.seed}"
+    command += f" --episode {chosen.episode} --out {out.name}"
+    made = store.provenance(command, motion["seeds"])
+    print(recorded.save(out, motion, {"study": chosen.study, "method": method, **made}))
 
 
 def _picture(motion: dict[str, Any], out: Path) -> Any:

@@ -36,7 +36,8 @@ def motion(
 
     Returns:
         `model` (MuJoCo), `t` (T,), `qpos` (T, nq), `tip` (T, 3), `force` (T, 3), N, on the peg,
-        `distance` (T,) to the goal, m, `markers` (name to (3,) or (T, 3)), `success`, `text`.
+        `distance` (T,) to the goal, m, `markers` (name to (3,) or (T, 3)), `success` at the end
+        and `touched` at any tick, `seeds` (the trained one's) and `text`.
 
     Raises:
         ValueError: for an unknown method, step or seed.
@@ -52,7 +53,7 @@ def motion(
     planning, limit, fields = study.planning(), np.array(study.task.u_limit), low_fields(task)
     with single_thread():
         obs, rows = task.reset(), []
-        success = False
+        success, touched = False, False
         for tick in range(study.task.ticks):
             if tick % study.task.horizon == 0:
                 seen = planning.observe(task, obs).reshape(seeds, 1, -1)
@@ -63,6 +64,7 @@ def motion(
             u = low.act(task.select(obs, fields).reshape(seeds, 1, -1), explore=False)
             obs, *_, info = task.step(u.reshape(seeds, -1) * limit)
             success = bool(info["success"][seed])
+            touched |= success
     qpos, tip, target, force = (np.array(part) for part in zip(*rows, strict=True))
     goal = obs[seed, task.layout["goal"]]
     markers = {"goal": goal}
@@ -79,5 +81,7 @@ def motion(
         "distance": distance,
         "markers": markers,
         "success": success,
+        "touched": touched,
+        "seeds": [int(record["seeds"][seed])],
         "text": f"{study.name}, {title}, seed {record['seeds'][seed]}: the tip {end}",
     }
