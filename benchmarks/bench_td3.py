@@ -1,0 +1,186 @@
+"""TD3 against Stable-Baselines3's, update for update, and what a two-level training costs in all.
+
+An update draws a batch from a full memory and moves both critics; every second one moves the actor
+and the targets too. Sizes of observation and action are those of the planner of peg push, and both
+programs hold the same random transitions. Stable-Baselines3 has tanh networks as ours are, and once
+more its own choice, ReLU. The last rows are whole trainings of five seeds: physics, both levels,
+memory and updates. There `ratio` is the aim of 0.6 ms for a step of a seed over what was measured.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from statistics import median
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from torch import nn
+
+from cmc.learning.replay import Replay
+from cmc.learning.td3 import TD3, TD3Config
+from cmc.studies import peg_maze, peg_push
+from cmc.studies.two_level import TwoLevelStudy
+from cmc.studies.two_level_parts import Planner, build
+
+PAPER, SMALL = (400, 300), (128, 128)
+ROWS, BATCH, PERIOD = 65_536, 128, 2
+WARM_UP, REPEATS = 20, 7
+CASES = [(peg_maze.STUDY, "ctd3"), (peg_maze.STUDY, "td3_corrected"), (peg_push.STUDY, "ctd3")]
+SEEDS, AIM_MS = 5, 0.6
+FIRST, STEPS, BLOCKS = 1_600, 800, 5
+"""Environment steps of a seed with random sub-goals, then in each timed block, and blocks."""
+
+Call = Callable[[], object]
+
+
+def _sizes() -> tuple[int, int]:
+    """Sizes of what the planner of peg push sees and does."""
+    study, planning = peg_push.STUDY, peg_push.STUDY.planning()
+    task = study.task_class(study.task, num=1)
+    return planning.observe(task, task.reset()).shape[-1], len(planning.low)
+
+
+def _data(observation: int, action: int) -> list[np.ndarray]:
+    """Random transitions: observation, action, reward, next observation."""
+    rng = np.random.default_rng(0)
+    seen, following = rng.standard_normal((2, ROWS, observation), dtype=np.float32)
+    done = rng.uniform(-1.0, 1.0, (ROWS, action)).astype(np.float32)
+    return [seen, done, rng.standard_normal(ROWS, dtype=np.float32), following]
+
+
+def _ours(data: list[np.ndarray], hidden: tuple[int, ...], seeds: int) -> Call:
+    inputs, outputs = data[0].shape[-1], data[1].shape[-1]
+    numbers = list(range(seeds))
+    replay = Replay(numbers, inputs, outputs, ROWS)
+    tiled = [np.broadcast_to(part, (seeds, *part.shape)) for part in data]
+    replay.add(*tiled, np.ones((seeds, ROWS)))  # type: ignore[call-arg]
+    config = TD3Config(critic_hidden=hidden, batch=BATCH, actor_period=PERIOD, target_period=PERIOD)
+    agent = TD3(Planner(inputs, outputs, hidden, numbers), numbers, inputs, outputs, config)
+    return lambda: agent.update(replay.sample(BATCH))
+
+
+def _theirs(data: list[np.ndarray], hidden: tuple[int, ...], unit: type[nn.Module]) -> Any:
+    """Stable-Baselines3's TD3 with a full memory."""
+    from stable_baselines3 import TD3 as SB3TD3
+    from stable_baselines3.common.logger import Logger
+
+    inputs, outputs = data[0].shape[-1], data[1].shape[-1]
+    c = TD3Config()
+    model = SB3TD3(
+        "MlpPolicy",
+        _Spaces(inputs, outputs),
+        learning_rate=c.critic_rate,
+        buffer_size=ROWS,
+        batch_size=BATCH,
+        tau=c.target_rate,
+        gamma=c.discount,
+        policy_delay=PERIOD,
+        target_policy_noise=c.target_noise,
+        target_noise_clip=c.target_noise_clip,
+        policy_kwargs={"net_arch": list(hidden), "activation_fn": unit},
+        seed=0,
+        device="cpu",
+    )
+    model.set_logger(Logger(None, []))
+    memory = model.replay_buffer
+    assert memory is not None
+    parts = (memory.observations, memory.actions, memory.rewards, memory.next_observations)
+    for part, values in zip(parts, data, strict=True):
+        part[:] = values.reshape(part.shape)
+    memory.full = True
+    return model
+
+
+class _Spaces(gym.Env):  # type: ignore[type-arg]
+    """Tells Stable-Baselines3 the sizes; never stepped."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (inputs,), np.float32)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (outputs,), np.float32)
+
+
+def _updates() -> Iterator[dict[str, Any]]:
+    data = _data(*_sizes())
+    for hidden, seeds, count in ((PAPER, 1, 60), (SMALL, SEEDS, 150)):
+        ours = _ours(data, hidden, seeds)
+        others = {
+            name: _theirs(data, hidden, unit)
+            for name, unit in (("tanh", nn.Tanh), ("ReLU", nn.ReLU))
+        }
+        runs: dict[str, Callable[[int], object]] = {
+            "ours": lambda n, f=ours: [f() for _ in range(n)],  # type: ignore[misc]
+            **{name: model.train for name, model in others.items()},
+        }
+        spent = _interleaved(runs, count)
+        mine = [1e3 * t / seeds for t in spent["ours"]]
+        for name in others:
+            theirs = [1e3 * t for t in spent[name]]
+            yield {
+                "name": f"TD3 update, {hidden}, {seeds} seed(s) / sb3 with {name}, per seed",
+                "ratio": round(min(theirs) / min(mine), 2),
+                "median_ratio": round(median(a / b for a, b in zip(theirs, mine, strict=True)), 2),
+                "ms": round(min(mine), 3),
+                "sb3_ms": round(min(theirs), 3),
+            }
+
+
+def _interleaved(runs: dict[str, Callable[[int], object]], count: int) -> dict[str, list[float]]:
+    """CPU seconds of one call's `count` updates, each; every repeat takes turns."""
+    spent: dict[str, list[float]] = {name: [] for name in runs}
+    for run in runs.values():
+        run(WARM_UP)
+    for _ in range(REPEATS):
+        for name, run in runs.items():
+            start = time.process_time()
+            run(count)
+            spent[name].append((time.process_time() - start) / count)
+    return spent
+
+
+def _trainer(study: TwoLevelStudy, method: str) -> Any:
+    """Five seeds of a training, just past its warm-up, with all updates on."""
+    short = replace(
+        study,
+        hierarchy=replace(study.hierarchy, warm_up=FIRST),
+        low=replace(study.low, critic_head_start=0),
+    )
+    trainer = build(short, method, list(range(SEEDS)))
+    while trainer.steps < FIRST + trainer.stride:
+        trainer.segment()
+    return trainer
+
+
+def _trainings() -> Iterator[dict[str, Any]]:
+    trainers = {f"{study.name} {method}": _trainer(study, method) for study, method in CASES}
+    spent: dict[str, list[float]] = {name: [] for name in trainers}
+    for _ in range(BLOCKS):
+        for name, trainer in trainers.items():
+            before, start = trainer.steps, time.process_time()
+            while trainer.steps < before + STEPS:
+                trainer.segment()
+            steps = SEEDS * (trainer.steps - before)
+            spent[name].append(1e3 * (time.process_time() - start) / steps)
+    for name, ms in spent.items():
+        yield {
+            "name": f"{name}, {SEEDS} seeds: {AIM_MS} ms / all-in CPU of a step and seed",
+            "ratio": round(AIM_MS / min(ms), 2),
+            "ms": round(min(ms), 3),
+            "median_ms": round(median(ms), 3),
+        }
+
+
+def run() -> Iterator[dict[str, Any]]:
+    """Yield one row for each comparison."""
+    warnings.filterwarnings("ignore", module="stable_baselines3")
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield from _updates()
+        yield from _trainings()
+    finally:
+        torch.set_num_threads(threads)
