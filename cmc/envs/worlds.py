@@ -16,7 +16,7 @@ import numpy as np
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from cmc.robot.batched import BatchedController, quat_multiply, rotation_vector
+from cmc.robot.batched import BatchedController, cross, quat_multiply, rotation_vector
 from cmc.robot.panda import DOWN, JOINTS
 from cmc.robot.task_space import ControlLaw, Gains, TaskSpaceController
 
@@ -68,6 +68,16 @@ class Worlds(Protocol):
 
     def tick_joint(self, target: Array, stiffness: float, u: Array) -> None:
         """One tick of joint control, torque = stiffness (q_d - q) + u + gravity and Coriolis."""
+
+    def push(self, force: Array) -> None:
+        """Let an external force (N, 3), N, act on the nominal tip, in world axes.
+
+        Force and moment are those of the hand's present pose and last until the next push or reset;
+        repeated at every tick, the force follows the tip. Zero takes it away.
+
+        Raises:
+            ValueError: on another shape, NaN or infinity.
+        """
 
     def get_state(self) -> Array:
         """Physics states (N, size), enough to continue exactly."""
@@ -174,6 +184,11 @@ class OneWorld:
             self.tip_velocity[0] = self.controller.velocity
             self.tip_velocity[0, :3] += axes @ self.data.qvel[JOINTS : JOINTS + 2]
 
+    def push(self, force: Array) -> None:
+        """See `Worlds.push`."""
+        axes = self.data.xmat[self._slide].reshape(1, 3, 3)
+        self.data.xfrc_applied[self._slide] = _wrench(force, axes @ _lever(self.model))[0]
+
     def get_state(self) -> Array:
         """See `Worlds.get_state`."""
         state = np.empty(mujoco.mj_stateSize(self.model, _STATE))
@@ -273,6 +288,11 @@ class ManyWorlds:
             slide = self.qvel[:, JOINTS : JOINTS + 2, None]
             self.tip_velocity[:, :3] += (axes @ slide)[..., 0]
 
+    def push(self, force: Array) -> None:
+        """See `Worlds.push`."""
+        wrench = _wrench(force, self._hand_mat.reshape(-1, 3, 3) @ _lever(self.model))
+        self.batch.bind("xfrc_applied")[:, self.model.body("hand").id] = wrench
+
     def get_state(self) -> Array:
         """See `Worlds.get_state`."""
         size = mujoco.mj_stateSize(self.model, _STATE)
@@ -285,11 +305,12 @@ class ManyWorlds:
         """See `Worlds.set_state`."""
         data = mujoco.MjData(self.model)
         warm, history = self.batch.bind("qacc_warmstart"), self.batch.bind("history")
-        clock = self.batch.bind("time")
+        clock, pushed = self.batch.bind("time"), self.batch.bind("xfrc_applied")
         for k in range(self.num):
             mujoco.mj_setState(self.model, data, state[k], _STATE)
             self.qpos[k], self.qvel[k], self._ctrl[k] = data.qpos, data.qvel, data.ctrl
             warm[k], history[k], clock[k] = data.qacc_warmstart, data.history, data.time
+            pushed[k] = data.xfrc_applied
         self._refresh()
 
 
@@ -316,6 +337,22 @@ def pose_quat(rotation: Array) -> Array:
     scale = np.divide(np.sin(angle / 2), angle, out=np.full_like(angle, 0.5), where=angle > 1e-9)
     turn = np.concatenate([np.cos(angle / 2), scale * rotation], -1)
     return quat_multiply(turn, np.broadcast_to(DOWN, turn.shape))
+
+
+def _lever(model: mujoco.MjModel) -> Array:
+    """From the hand's center of mass, where MuJoCo applies forces, to the nominal tip, (3,), m."""
+    lever: Array = model.site("tip_nominal").pos - model.body("hand").ipos
+    return lever
+
+
+def _wrench(force: Array, lever: Array) -> Array:
+    """Force and moment (N, 6) on the hand of forces (N, 3) at the ends of levers (N, 3)."""
+    force = np.asarray(force, dtype=float)
+    if force.shape != lever.shape:
+        raise ValueError(f"push: wanted shape {lever.shape}, got {force.shape}")
+    if not np.isfinite(force).all():
+        raise ValueError(f"push: wanted finite numbers, got {force.tolist()}")
+    return np.concatenate([force, cross(lever, force)], -1)
 
 
 def _is_compliant(model: mujoco.MjModel) -> bool:

@@ -18,6 +18,8 @@ from cmc.studies.two_level_parts import N
 
 Array = NDArray[np.float64]
 TEST_SEED = 900_000  # test worlds never share a stream with training
+PUSH = 2.0
+"""Force on the tip when consistency under pushes is measured, N."""
 
 
 @dataclass(frozen=True)
@@ -89,8 +91,20 @@ def run_episodes(
     )
 
 
-def summary(found: Episodes) -> dict[str, Any]:
-    """Figures of test episodes, per seed where they differ; JSON."""
+def summary(found: Episodes, every: bool = False) -> dict[str, Any]:
+    """Figures of test episodes, per seed where they differ; JSON.
+
+    Args:
+        found: the episodes.
+        every: whether both distances to the goal of every episode are added, as `nearest_mm_all`
+            and `final_mm_all`, lists by seed of lists, rounded to 0.01 mm.
+
+    Returns:
+        Shares of `success` (last tick) and of `touched` (any tick) with intervals over all
+        episodes, `passed_by` (share that touched but was elsewhere at the last tick), `return`,
+        medians of the distances `nearest_mm` and `final_mm`, shares of ticks by contact `force`,
+        and the deepest `penetration_mm`.
+    """
     shares = {}
     for rule, force in (("at_50_hz", found.force), ("largest", found.force_max)):
         shares[rule] = {
@@ -99,15 +113,18 @@ def summary(found: Episodes) -> dict[str, Any]:
             "below_5_N": float((force < 5).mean()),
             "largest_N": float(force.max()),
         }
+    distances = {"nearest_mm": 1e3 * found.nearest, "final_mm": 1e3 * found.final}
+    each = {f"{name}_all": mm.round(2).tolist() for name, mm in distances.items()}
     return {
         "episodes": found.success.shape[1],
         "success": found.success.mean(1).tolist(),
         "success_interval": interval(int(found.success.sum()), found.success.size),
         "touched": found.touched.mean(1).tolist(),
         "touched_interval": interval(int(found.touched.sum()), found.touched.size),
+        "passed_by": (found.touched & ~found.success).mean(1).tolist(),
         "return": found.total.mean(1).tolist(),
-        "nearest_mm": (1e3 * np.median(found.nearest, axis=1)).tolist(),
-        "final_mm": (1e3 * np.median(found.final, axis=1)).tolist(),
+        **{name: np.median(mm, axis=1).tolist() for name, mm in distances.items()},
+        **(each if every else {}),
         "force": shares,
         "penetration_mm": (1e3 * found.penetration.max(1)).tolist(),
     }
@@ -124,30 +141,55 @@ def interval(hits: int, tries: int, level: float = 0.95) -> list[float]:
 def consistency(
     study: TwoLevelStudy, low: LowLevel, seeds: int, starts: int = 16
 ) -> dict[str, Array]:
-    """Spread of the tip's displacement over one segment, for one sub-goal and many starts.
+    """Spread of the tip's displacement over one segment for one sub-goal, over starts and pushes.
 
     In free space (the task without its obstacles) every world starts an episode anew, is moved by a
     random sub-goal for one segment, so that it starts the next one elsewhere and in motion, and is
-    then asked for a step of 5 mm along -x.
+    then asked for a step of 5 mm along -x. Afterwards it goes back to where that step began and
+    does it again while a force of `PUSH` newtons acts on the tip, in a direction drawn for each
+    start uniformly on the sphere and fixed for the segment. Starts and pushes are the same for all
+    seeds and methods. Sub-goals are not clamped here, so that the step is 5 mm everywhere.
 
     Returns:
-        `mean`, the displacement along the step, and `spread`, the root of the summed variances of
-        the displacement over starts, per seed, (seeds,), m.
+        Over starts, per seed: `mean`, the displacement along the step, (seeds,), m; `mean_vector`,
+        the displacement, (seeds, 3), m; `spread`, the root of the summed variances of the
+        displacement, (seeds,), m; `pushed`, the root mean square distance between the ends of the
+        segment with the push and without it from the same start, (seeds,), m.
     """
-    study = replace(study, task=replace(study.task, scene="panda.xml"))
-    task = study.task_class(study.task, num=seeds * starts, seed=TEST_SEED + 1)
+    free = _free_space(study)
+    task = free.task_class(free.task, num=seeds * starts)
+    task.seed([TEST_SEED + 1 + k for k in range(starts)] * seeds)
     rng = np.random.default_rng(TEST_SEED)
     low_end, high_end = np.array(study.task.subgoal_low), np.array(study.task.subgoal_high)
     task.reset()
     first = rng.uniform(low_end, high_end, (starts, len(low_end)))
+    direction = rng.standard_normal((starts, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     obs = task.set_subgoal(np.tile(first, (seeds, 1)))
-    _ticks(task, low, obs, seeds, study)
-    before = task.worlds.tip.copy()
-    obs = task.set_subgoal(_step_in_x(task, study, -0.005))
-    _ticks(task, low, obs, seeds, study)
-    moved = (task.worlds.tip - before).reshape(seeds, starts, 3)
-    spread = np.sqrt(moved.var(1).sum(-1))
-    return {"mean": -moved[..., 0].mean(1), "spread": spread}
+    _ticks(task, low, obs, seeds, free)
+    start, before = task.snapshot(), task.worlds.tip.copy()
+    ends = []
+    for push in (None, np.tile(PUSH * direction, (seeds, 1))):
+        task.restore(start)
+        obs = task.set_subgoal(_step_in_x(task, free, -0.005))
+        _ticks(task, low, obs, seeds, free, push)
+        ends.append((task.worlds.tip - before).reshape(seeds, starts, 3))
+    moved, pushed = ends
+    return {
+        "mean": -moved[..., 0].mean(1),
+        "mean_vector": moved.mean(1),
+        "spread": np.sqrt(moved.var(1).sum(-1)),
+        "pushed": np.sqrt(((pushed - moved) ** 2).sum(-1).mean(1)),
+    }
+
+
+def _free_space(study: TwoLevelStudy) -> TwoLevelStudy:
+    """The study without obstacles, and without bounds that would shorten a step near the edge."""
+    bounds: dict[str, Any] = {}
+    for name in ("subgoal", "workspace"):
+        size = len(getattr(study.task, f"{name}_low"))
+        bounds |= {f"{name}_low": (-1.0,) * size, f"{name}_high": (1.0,) * size}
+    return replace(study, task=replace(study.task, scene="panda.xml", **bounds))
 
 
 def _step_in_x(task: Any, study: TwoLevelStudy, length: float) -> Array:
@@ -168,9 +210,19 @@ def _step_in_x(task: Any, study: TwoLevelStudy, length: float) -> Array:
     return step
 
 
-def _ticks(task: Any, low: LowLevel, obs: Array, seeds: int, study: TwoLevelStudy) -> None:
+def _ticks(
+    task: Any,
+    low: LowLevel,
+    obs: Array,
+    seeds: int,
+    study: TwoLevelStudy,
+    push: Array | None = None,
+) -> None:
+    """One segment; a push (worlds, 3), N, follows the tip."""
     limit = np.array(study.task.u_limit)
     for _ in range(study.task.horizon):
+        if push is not None:
+            task.worlds.push(push)
         seen = task.select(obs, low_fields(task)).reshape(seeds, task.num // seeds, -1)
         u = low.act(seen, explore=False)
         obs, *_ = task.step(u.reshape(task.num, -1) * limit)

@@ -20,6 +20,8 @@ Progress = Callable[[int, int, str], object]
 Folder = str | Path | None
 EARLIER = 5
 """Policies kept on the way are tested by this many times fewer episodes than the last one."""
+FORMAT = 2
+"""Of kept tests; raised when their figures change, so that older ones are not used."""
 CURVE = 100
 """Points of a learning curve."""
 
@@ -98,11 +100,15 @@ def evaluate_method(
 
     Returns:
         `title`, `seeds`, `training` (the learning curve), `tests` (one for each kept policy: `step`
-        and what `summary` holds, `consistency`, `gains`), `final` (the last of them), and
-        `force_over_tests`, the shares averaged over all kept policies.
+        and what `summary` holds, `consistency`, `gains`), `final` (the last of them),
+        `force_over_tests`, the shares averaged over all kept policies, and two figures by seed of
+        how much the low level changed while it learned: `consistency_over_training_mm`, the root
+        of the summed variances over the kept policies of the mean displacement (`consistency`), and
+        `consistency_late_mm`, the same over those of the second half of training. Both are None
+        with less than two policies.
     """
     here, arm = study.of(name), study.method(name)
-    print_of = hashlib.sha256(path.read_bytes() + f"{here}".encode()).hexdigest()
+    print_of = hashlib.sha256(path.read_bytes() + f"{FORMAT} {here}".encode()).hexdigest()
     earlier = store.read_json(file) if file.is_file() else {}
     ready = earlier.get("tests", []) if earlier.get("fingerprint") == print_of else []
     found, tests = marks(study, name, path), []
@@ -112,7 +118,11 @@ def evaluate_method(
             step(number, f"{name}, step {mark}")
         known = [t for t in ready if t["step"] == mark and t["episodes"] == episodes]
         with single_thread():
-            made = known[0] if known else _test(here, study, name, path, mark, episodes)
+            made = (
+                known[0]
+                if known
+                else _test(here, study, name, path, mark, episodes, mark == found[-1])
+            )
         tests.append(made)
         later = [t for t in ready if all(t is not kept for kept in tests)]
         store.write_json(file, {"fingerprint": print_of, "tests": tests + later})
@@ -124,16 +134,24 @@ def evaluate_method(
         "tests": tests,
         "final": tests[-1],
         "force_over_tests": _mean_shares(tests),
+        "consistency_over_training_mm": _over_training(tests),
+        "consistency_late_mm": _over_training([t for t in tests if 2 * t["step"] >= found[-1]]),
     }
 
 
 def _test(
-    here: TwoLevelStudy, study: TwoLevelStudy, name: str, path: Path, mark: int, episodes: int
+    here: TwoLevelStudy,
+    study: TwoLevelStudy,
+    name: str,
+    path: Path,
+    mark: int,
+    episodes: int,
+    last: bool,
 ) -> dict[str, Any]:
     """One kept policy; `here` is the study as the method runs it."""
     planner, low, record = load(study, name, mark, path)
     seeds = len(record["seeds"])
-    figures = summary(run_episodes(here, planner, low, seeds, episodes))
+    figures = summary(run_episodes(here, planner, low, seeds, episodes), every=last)
     moved = consistency(here, low, seeds)
     figures["consistency_mm"] = {key: (1e3 * value).tolist() for key, value in moved.items()}
     silent = isinstance(low, Fixed) and low.actor is None
@@ -163,6 +181,15 @@ def _mean_shares(tests: list[dict[str, Any]]) -> dict[str, Any]:
         }
         for rule in rules
     }
+
+
+def _over_training(tests: list[dict[str, Any]]) -> list[float] | None:
+    """Spread over policies of the mean displacement, by seed, mm."""
+    if len(tests) < 2:
+        return None
+    means = np.array([test["consistency_mm"]["mean_vector"] for test in tests])
+    spread: list[float] = np.sqrt(means.var(0).sum(-1)).tolist()
+    return spread
 
 
 def verdict(method: dict[str, Any]) -> str:

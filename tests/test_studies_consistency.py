@@ -1,0 +1,175 @@
+"""How consistent a low level is: over starts, pushes and training; how distances are counted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+
+from cmc import store
+from cmc.envs.panda_task import PandaTask
+from cmc.envs.peg_maze import SOFT, STIFF, PegMaze
+from cmc.envs.peg_push import PUSH, PegPush
+from cmc.learning.low_level import Fixed
+from cmc.studies import peg_maze, peg_push, two_level_evaluation, two_level_results
+from cmc.studies.two_level_evaluation import Episodes, consistency, summary
+
+FORCES = np.array([[2.0, 0, 0], [0, -1.0, 0.5], [0.3, 0.4, -1.2]])
+
+
+def _free(config, **changes):
+    return replace(config, scene="panda.xml", start_joints=0.0, start_box=(0.0,) * 3, **changes)
+
+
+def _push(task: PandaTask, force: np.ndarray, ticks: int) -> None:
+    """Ticks under a force, in joint space with no stiffness: nothing but gravity is carried."""
+    for _ in range(ticks):
+        task.worlds.push(force)
+        task.worlds.tick_joint(task.worlds.qpos[:, :7], 0.0, np.zeros((task.num, 7)))
+
+
+@pytest.mark.parametrize("peg", [STIFF, SOFT, PUSH], ids=["stiff", "soft", "push"])
+@pytest.mark.parametrize("num", [1, 3])
+def test_a_pushed_arm_moves_as_the_engine_says_for_a_generalized_force(num: int, peg) -> None:
+    config = _free(peg, hold=False)
+    task = PegMaze(config, num, seed=0)
+    model, data = task.worlds.model, mujoco.MjData(task.worlds.model)
+    hand, site = model.body("hand").id, model.site("tip_nominal").id
+    _push(task, FORCES[:num], ticks=10)
+    for k in range(num):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:7] = task._q_start
+        for _ in range(100):
+            mujoco.mj_step1(model, data)
+            data.ctrl[:], data.qfrc_applied[:] = data.qfrc_bias[:7], 0.0
+            tip = data.site_xpos[site]
+            mujoco.mj_applyFT(model, data, FORCES[k], np.zeros(3), tip, hand, data.qfrc_applied)
+            mujoco.mj_step2(model, data)
+        mujoco.mj_step1(model, data)
+        moved = np.linalg.norm(data.site_xpos[site] - np.array(config.start))
+        assert moved > 1e-3
+        np.testing.assert_allclose(task.worlds.nominal[k], data.site_xpos[site], atol=1e-3 * moved)
+
+
+@pytest.mark.parametrize("num", [1, 3])
+def test_a_held_arm_gives_way_by_the_force_over_stiffness_and_effective_mass(num: int) -> None:
+    task = PegPush(_free(PUSH, workspace_low=(-1.0,) * 3, workspace_high=(1.0,) * 3), num, seed=0)
+    task.reset()
+    for _ in range(600):
+        task.worlds.push(0.1 * FORCES[:num])
+        task.step(np.zeros((num, 6)))
+    assert np.abs(task.worlds.signals[:, 6:]).max() < 1e-4
+    data = mujoco.MjData(task.worlds.model)
+    for k in range(num):
+        data.qpos[:] = task.worlds.qpos[k]
+        mujoco.mj_forward(task.worlds.model, data)
+        jac, solved = np.zeros((6, 7)), np.zeros((6, 7))
+        site = task.worlds.model.site("tip_nominal").id
+        mujoco.mj_jacSite(task.worlds.model, data, jac[:3], jac[3:], site)
+        mujoco.mj_solveM(task.worlds.model, data, solved, jac)
+        # At rest K_p e + J M^-1 J^T F = 0: the acceleration that the force alone would cause.
+        expected = -(solved @ jac.T)[:, :3] @ (0.1 * FORCES[k]) / PUSH.gains.kp
+        np.testing.assert_allclose(task.worlds.signals[k, :6], expected, rtol=0.01, atol=2e-5)
+
+
+@pytest.mark.parametrize("num", [1, 2])
+def test_a_push_ends_with_a_reset_and_travels_in_a_snapshot(num: int) -> None:
+    task, quiet = (PegPush(_free(PUSH), num, seed=0) for _ in range(2))
+    force, still = FORCES[:num], np.zeros((num, 6))
+    for t in (task, quiet):
+        t.reset()
+    task.worlds.push(force)
+    kept = task.snapshot()
+    task.step(still)
+    ends = [task.worlds.qpos.copy()]
+    task.worlds.push(np.zeros((num, 3)))
+    task.restore(kept)
+    task.step(still)
+    ends.append(task.worlds.qpos.copy())
+    quiet.step(still)
+    np.testing.assert_array_equal(*ends)
+    assert np.abs(ends[0] - quiet.worlds.qpos).max() > 1e-6
+    for t in (task, quiet):
+        t.seed(3)
+        t.reset()
+        t.step(still)
+    np.testing.assert_array_equal(task.worlds.qpos, quiet.worlds.qpos)
+
+
+@pytest.mark.parametrize("num", [1, 2])
+def test_a_push_of_wrong_shape_or_not_finite_is_refused(num: int) -> None:
+    worlds = PegPush(_free(PUSH), num, seed=0).worlds
+    with pytest.raises(ValueError, match=rf"push: wanted shape \({num}, 3\), got \(3,\)"):
+        worlds.push(np.zeros(3))
+    with pytest.raises(ValueError, match="push: wanted finite numbers"):
+        worlds.push(np.full((num, 3), np.nan))
+
+
+class Linear(Fixed):
+    """u = clip(gain y): one gain for each seed."""
+
+    def __init__(self, *gains: float) -> None:
+        super().__init__(None)
+        self.gains = np.array(gains)[:, None, None]
+
+    def act(self, observation, explore):
+        return np.clip(self.gains * observation[..., :6], -1.0, 1.0)
+
+
+@pytest.mark.parametrize("study", [peg_push.STUDY, peg_maze.STUDY], ids=lambda s: s.name)
+def test_a_higher_gain_resists_pushes_and_starts(study) -> None:
+    found = consistency(study, Linear(0.0, 20.0, 0.0), seeds=3, starts=8)
+    for key in ("mean", "spread", "pushed", "mean_vector"):
+        np.testing.assert_allclose(found[key][0], found[key][2], rtol=1e-9)  # the same worlds
+    assert found["mean"][1] > found["mean"][0]
+    assert found["pushed"][1] < found["pushed"][0]
+    np.testing.assert_allclose(-found["mean_vector"][:, 0], found["mean"])
+
+
+def test_a_step_is_five_millimeters_wherever_it_starts() -> None:
+    """Near the edge of the maze's box a clamped step would be shorter; here the spread is small."""
+    found = consistency(peg_maze.STUDY, Linear(50.0), seeds=1, starts=16)
+    assert found["mean"][0] > 0.003
+    assert found["spread"][0] < 0.001
+
+
+def test_the_spread_without_action_is_what_the_push_does_to_the_gains_alone(monkeypatch) -> None:
+    """Without action the loop is nearly linear, so that the effect scales with the force."""
+    spreads = []
+    for force in (0.0, 0.2, 0.4):
+        monkeypatch.setattr(two_level_evaluation, "PUSH", force)
+        spreads.append(consistency(peg_push.STUDY, Linear(0.0), seeds=1, starts=4)["pushed"][0])
+    assert spreads[0] < 1e-12
+    assert spreads[2] / spreads[1] == pytest.approx(2.0, rel=0.02)
+
+
+def _test_of(step: int, vectors: list[list[float]]) -> dict:
+    return {"step": step, "consistency_mm": {"mean_vector": vectors}}
+
+
+def test_spread_over_training_counts_every_direction_by_seed() -> None:
+    swing = [
+        _test_of(k, [[3.0, 0.0, 0.0], [3.0 + (-1) ** k, 2.0 * (-1) ** k, 1.0]]) for k in (1, 2)
+    ]
+    still, moving = two_level_results._over_training(swing)
+    assert still == 0.0
+    assert moving == pytest.approx(np.sqrt(1.0 + 4.0))
+    assert two_level_results._over_training(swing[:1]) is None
+
+
+def test_an_episode_that_touches_and_leaves_has_passed_by() -> None:
+    success = np.array([[True, False, False, False]])
+    touched = np.array([[True, True, True, False]])
+    distance = np.array([[0.0001, 0.0104, 0.0312344, 0.02]])
+    nearest = np.minimum(distance, [[1.0, 0.0002, 0.0003, 0.015]])
+    force = np.zeros((2, 1, 4))
+    found = Episodes(success, touched, distance, nearest, distance, force, force, distance)
+    figures = summary(found, every=True)
+    assert figures["passed_by"] == [0.5]
+    assert figures["final_mm_all"] == [[0.1, 10.4, 31.23, 20.0]]
+    assert figures["nearest_mm_all"] == [[0.1, 0.2, 0.3, 15.0]]
+    assert figures["final_mm"] == pytest.approx([15.2])
+    assert not {"nearest_mm_all", "final_mm_all"} & set(summary(found))
+    store.json.dumps(figures, allow_nan=False)
