@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -59,9 +60,8 @@ class PandaTask:
         self._q_start = inverse_kinematics(config.start, tool=tool)
         law = replace(config.law, posture=tuple(self._q_start))
         substeps = round(config.tick / config.timestep)
-        model = load_scene(config.scene, config.peg, config.timestep, history=substeps)
         self.worlds: Worlds = make_worlds(
-            model, config.gains, law, substeps, config.hold, num, threads
+            self._scene(substeps), config.gains, law, substeps, config.hold, num, threads
         )
         self.seed(seed)
         latent = config.gains.latent
@@ -101,6 +101,11 @@ class PandaTask:
         self.reset()
 
     # -- what a task defines -------------------------------------------------------------------
+
+    def _scene(self, history: int) -> mujoco.MjModel:
+        """The compiled scene; contact sensors remember `history` physics steps."""
+        c = self.config
+        return load_scene(c.scene, c.peg, c.timestep, history=history)
 
     def _own_fields(self) -> dict[str, int]:
         """Further observation fields and their sizes."""

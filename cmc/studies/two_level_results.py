@@ -57,9 +57,9 @@ def evaluate(
     count = study.episodes if trajectories is None else trajectories
     if count < 1:
         raise ValueError(f"trajectories: wanted at least 1, got {count}")
-    found = [name for name in study.methods if _path(study, name, checkpoints).is_file()]
+    found = [name for name in study.methods if find_checkpoint(study, name, checkpoints).is_file()]
     wanted = found if names is None else [*names]
-    paths = {name: _path(study, name, checkpoints) for name in wanted}
+    paths = {name: find_checkpoint(study, name, checkpoints) for name in wanted}
     kept = Path(folder) if folder is not None else Path("runs") / study.name / "results"
     total, done = sum(len(marks(study, name, path)) for name, path in paths.items()), 0
     methods: dict[str, Any] = {}
@@ -207,7 +207,12 @@ def verdict(method: dict[str, Any]) -> str:
     )
 
 
-def _path(study: TwoLevelStudy, name: str, checkpoints: Folder) -> Path:
+def find_checkpoint(study: TwoLevelStudy, name: str, checkpoints: Folder = None) -> Path:
+    """Checkpoint file of a method: in the folder, else the shipped one, else that of `runs`.
+
+    Raises:
+        ValueError: for an unknown method.
+    """
     study.method(name)
     file = f"{study.name}_{name}.safetensors"
     if checkpoints is not None:
