@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from test_studies_two_level import small
 
 from cmc import store
 from cmc.envs.panda_task import PandaTask
@@ -14,7 +16,8 @@ from cmc.envs.peg_maze import SOFT, STIFF, PegMaze
 from cmc.envs.peg_push import PUSH, PegPush
 from cmc.learning.low_level import Fixed
 from cmc.studies import peg_maze, peg_push, two_level_evaluation, two_level_results
-from cmc.studies.two_level_evaluation import Episodes, consistency, summary
+from cmc.studies.two_level_evaluation import Episodes, consistency, run_episodes, summary
+from cmc.studies.two_level_training import train
 
 FORCES = np.array([[2.0, 0, 0], [0, -1.0, 0.5], [0.3, 0.4, -1.2]])
 
@@ -173,3 +176,32 @@ def test_an_episode_that_touches_and_leaves_has_passed_by() -> None:
     assert figures["final_mm"] == pytest.approx([15.2])
     assert not {"nearest_mm_all", "final_mm_all"} & set(summary(found))
     store.json.dumps(figures, allow_nan=False)
+
+
+def test_every_kept_policy_has_the_figures_and_older_files_are_not_used(
+    tmp_path: Path, monkeypatch
+) -> None:
+    study = small(peg_maze.STUDY)
+    train(study, "hiro", [0, 1], steps=240, out=tmp_path)
+    options = {"trajectories": 2, "folder": tmp_path / "tests", "checkpoints": tmp_path}
+    monkeypatch.setattr(two_level_results, "FORMAT", two_level_results.FORMAT - 1)
+    two_level_results.evaluate(study, **options)
+    monkeypatch.undo()
+    runs: list[int] = []
+    monkeypatch.setattr(
+        two_level_results, "run_episodes", lambda *given: runs.append(1) or run_episodes(*given)
+    )
+    found = [two_level_results.evaluate(study, **options)["methods"]["hiro"] for _ in range(2)]
+    assert len(runs) == 2  # one for each of two policies, and none the second time
+    assert found[0]["tests"] == found[1]["tests"]
+    first, last = found[0]["tests"]
+    assert "final_mm_all" not in first
+    assert np.shape(last["final_mm_all"]) == np.shape(last["nearest_mm_all"]) == (2, 2)
+    for test in (first, last):
+        assert np.shape(test["consistency_mm"]["mean_vector"]) == (2, 3)
+        assert (np.array(test["consistency_mm"]["pushed"]) > 0.0).all()
+        assert len(test["passed_by"]) == 2
+    change = [test["consistency_mm"]["mean_vector"] for test in (first, last)]
+    expected = np.linalg.norm(np.subtract(*change), axis=-1) / 2
+    np.testing.assert_allclose(found[0]["consistency_over_training_mm"], expected)
+    np.testing.assert_allclose(found[0]["consistency_late_mm"], expected)
