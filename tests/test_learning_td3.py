@@ -88,6 +88,22 @@ def test_it_solves_a_problem_with_a_known_best_action() -> None:
     assert float(best.square().mean().sqrt()) > 0.25  # doing nothing is no answer
 
 
+def test_the_actor_climbs_the_first_critic_of_its_own_seed() -> None:
+    agent, replay = learner([4, 9])
+    batch = replay.sample(32)
+    found = agent._action_gradient(batch.observation, batch.action)
+    shifts = 1e-2 * torch.eye(ACTION)
+    for k in range(ACTION):
+        ends = [
+            agent.values(agent.critics, batch.observation, batch.action + sign * shifts[k])[:, 0]
+            for sign in (1.0, -1.0)
+        ]
+        expected = (ends[0] - ends[1]).detach() / 2e-2
+        torch.testing.assert_close(found[..., k], expected, atol=2e-3, rtol=0.0)
+    assert float(found.abs().mean()) > 0.05
+    assert all(p.grad is None for p in agent.critics.parameters())
+
+
 def test_the_actor_step_is_bounded_by_the_clip_of_dq_da() -> None:
     gradients = []
     for clip in (None, 1e-3):

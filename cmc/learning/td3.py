@@ -143,9 +143,7 @@ class TD3:
 
     def _update_actor(self, batch: Batch) -> None:
         action = self.actor(batch.observation)
-        free = action.detach().requires_grad_()
-        value = self.values(self.critics, batch.observation, free)[:, 0]
-        (slope,) = torch.autograd.grad(value.sum(), free)  # dQ/da
+        slope = self._action_gradient(batch.observation, action.detach())
         clip = self.config.action_gradient_clip
         if clip is not None:
             slope = slope.clamp(-clip, clip)
@@ -153,6 +151,14 @@ class TD3:
         (-(slope * action).sum() / action.shape[1]).backward()
         self._clip(self.actor)
         self.actor_adam.step()
+
+    def _action_gradient(self, observation: Tensor, action: Tensor) -> Tensor:
+        """dQ/da of the first critic alone, (seeds, batch, action)."""
+        x = torch.cat([observation * self._scale, action], dim=-1).requires_grad_()
+        parts = (self.critics.weights, self.critics.biases)
+        weights, biases = ([p.detach()[::2] for p in part] for part in parts)
+        (slope,) = torch.autograd.grad(self.critics.run(x, weights, biases).sum(), x)
+        return slope[..., observation.shape[-1] :]
 
     def _smoothing(self, like: Tensor) -> Tensor:
         noise = [generator.standard_normal(like.shape[1:]) for generator in self._generators]

@@ -94,9 +94,12 @@ class StackedMLP(nn.Module):
         """Evaluate all networks: x (stack, batch, inputs) to (stack, batch, outputs)."""
         return self.run(x, list(self.weights))
 
-    def run(self, x: Tensor, weights: Sequence[Tensor]) -> Tensor:
-        """Evaluate with the given weights (stack, in, out) in place of the parameters."""
-        return _Network.apply(x, len(weights), *weights, *self.biases)
+    def run(
+        self, x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor] | None = None
+    ) -> Tensor:
+        """Evaluate with the given weights (stack, in, out), and biases, in place of our own."""
+        biases = list(self.biases) if biases is None else biases
+        return _Network.apply(x, len(weights), *weights, *biases)
 
     def hidden_values(self, x: Tensor, weights: Sequence[Tensor]) -> list[Tensor]:
         """Values after every layer, the output last; x (stack, batch, inputs)."""
@@ -142,18 +145,22 @@ class _Network(torch.autograd.Function):
             found = iter(torch.autograd.grad(output, inputs, gradients[0], create_graph=True))
             whole = [next(found) if t.requires_grad else None for t in (x, *weights, *biases)]
             return whole[0], None, *whole[1:]
-        values = [x, *saved[len(weights) + len(biases) :]]
-        slope, to_weights, to_biases = gradients[0], [], []
+        values, wanted = [x, *saved[len(weights) + len(biases) :]], ctx.needs_input_grad
+        slope = gradients[0]
+        to_weights: list[Tensor | None] = [None] * depth
+        to_biases: list[Tensor | None] = [None] * len(biases)
         for layer in range(depth - 1, -1, -1):
-            to_weights.append(torch.bmm(values[layer].transpose(1, 2), slope))
-            if biases:
-                to_biases.append(slope.sum(1, keepdim=True))
-            if layer > 0 or ctx.needs_input_grad[0]:
-                slope = torch.bmm(slope, weights[layer].transpose(1, 2))
+            if wanted[2 + layer]:
+                to_weights[layer] = torch.bmm(values[layer].transpose(1, 2), slope)
+            if biases and wanted[2 + depth + layer]:
+                to_biases[layer] = slope.sum(1, keepdim=True)
+            if layer > 0 or wanted[0]:
+                back = weights[layer].transpose(1, 2)
+                # One output: an outer product, which costs less than a matrix product.
+                slope = slope * back if slope.shape[-1] == 1 else torch.bmm(slope, back)
             if layer > 0:
                 slope = torch.ops.aten.tanh_backward(slope, values[layer])
-        to_input = slope if ctx.needs_input_grad[0] else None
-        return to_input, None, *to_weights[::-1], *to_biases[::-1]
+        return slope if wanted[0] else None, None, *to_weights, *to_biases
 
 
 def _draw(
