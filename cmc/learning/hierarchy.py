@@ -38,6 +38,8 @@ class HierarchyConfig:
         high_updates: planner updates for each round (`tab:para`: 100).
         low_updates: low-level updates for each round.
         high_noise: standard deviation of the planner's noise, in half-ranges (our choice).
+        high_noise_end: what it falls to, linearly, or None if it stays (our choice).
+        noise_steps: environment steps of a seed until it has fallen (our choice).
         warm_up: environment steps of a seed with random sub-goals and no learning (our choice).
         reward_scale: factor on the mean reward of a segment (our choice).
         capacity: segments that the planner remembers (`tab:para`: 65536).
@@ -48,6 +50,8 @@ class HierarchyConfig:
     high_updates: int = 100
     low_updates: int = 100
     high_noise: float = 0.3
+    high_noise_end: float | None = None
+    noise_steps: int = 500_000
     warm_up: int = 10_000
     reward_scale: float = 1.0
     capacity: int = 65536
@@ -57,6 +61,16 @@ class HierarchyConfig:
             raise ValueError(f"worlds, samples and capacity must be at least 1: {self}")
         if min(self.high_updates, self.low_updates, self.warm_up) < 0:
             raise ValueError(f"updates and warm_up must not be negative: {self}")
+        noise = (self.high_noise, self.high_noise_end or 0.0)
+        if min(noise) < 0 or self.noise_steps < 1:
+            raise ValueError(f"wanted noise of at least 0 and noise_steps of at least 1: {self}")
+
+    def noise(self, steps: int) -> float:
+        """Standard deviation of the planner's noise after so many steps, in half-ranges."""
+        if self.high_noise_end is None:
+            return self.high_noise
+        done = min(steps / self.noise_steps, 1.0)
+        return self.high_noise + done * (self.high_noise_end - self.high_noise)
 
 
 class Relabeller(Protocol):
@@ -149,7 +163,7 @@ class TwoLevel:
             drawn = np.stack([g.uniform(-1.0, 1.0, count) for g in self._generators])
             return np.clip(middle + drawn, -1.0, 1.0)
         noise = np.stack([g.standard_normal(count) for g in self._generators])
-        action = evaluate(self.planner.actor, seen) + self.config.high_noise * noise
+        action = evaluate(self.planner.actor, seen) + self.config.noise(self.steps) * noise
         return np.clip(action, -1.0, 1.0)
 
     def _learn(self, before: int) -> None:

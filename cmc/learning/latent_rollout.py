@@ -44,7 +44,7 @@ class LatentConfig:
     batch: int = 64
     blocked: float = 0.2
     force_limit: float = 1.0
-    force_weight: float = 0.05
+    force_weight: float = 0.5
     effort_weight: float = 0.0
     memory: int = 4096
     rotation_scale: float = 100.0
