@@ -8,6 +8,7 @@ with `describe(fig, "what is to be seen")`. Labels hold units and may hold matht
 from cmc.view.algebra import eigenvalues, matrices, matrix
 from cmc.view.motion import convergence, distances, grid, phase_portrait, trajectories
 from cmc.view.results import curves, histogram, learning_curves, region
+from cmc.view.spread import seed_dots
 from cmc.view.style import (
     BAD,
     COLORS,
@@ -42,6 +43,7 @@ __all__ = [
     "phase_portrait",
     "region",
     "save",
+    "seed_dots",
     "trajectories",
     "use_style",
 ]
