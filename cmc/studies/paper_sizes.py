@@ -36,7 +36,7 @@ SHORT = 20_000
 class Meter:
     """CPU time of a training's learning steps, measured in each session and kept in a file.
 
-    A session is one process. Steps that are done again after a stop count twice, as their time.
+    A session is one process. Steps that are done again after a stop count twice, as does their time.
     """
 
     def __init__(self, path: Path, study: TwoLevelStudy) -> None:
@@ -66,41 +66,38 @@ class Meter:
 
 def sizes(study: TwoLevelStudy) -> dict[str, list[int]]:
     """Hidden sizes of planner, critics and low level."""
-    hidden = (study.planner_hidden, study.planner.critic_hidden, study.low_hidden)
-    return {name: list(h) for name, h in zip(("planner", "critics", "low"), hidden, strict=True)}
+    critics, low = list(study.planner.critic_hidden), list(study.low_hidden)
+    return {"planner": list(study.planner_hidden), "critics": critics, "low": low}
 
 
 def run(
     study: TwoLevelStudy = STUDY,
     ours: TwoLevelStudy = peg_maze.STUDY,
     *,
-    steps: int | None = None,
-    episodes: int | None = None,
-    out: str | Path,
+    out: Path,
+    steps: int = STUDY.steps,
+    episodes: int = STUDY.episodes,
 ) -> dict[str, Any]:
     """Train, test and measure; finished parts are not repeated.
 
     Args:
         study: with the paper's sizes.
         ours: with ours.
-        steps: of the training, in place of the study's.
-        episodes: of the last test, in place of the study's.
         out: folder of the run.
+        steps: of the training.
+        episodes: of the last test.
 
     Returns:
         What `evaluate_method` answers, `sizes`, `cpu_ms_per_step` and the `sessions` that it was
         measured in; under `ours` the sizes and the cost of one seed at our sizes.
     """
-    total = study.steps if steps is None else steps
-    folder = Path(out)
-    file, meter = folder / "ours.json", Meter(folder / "cost.json", study)
+    file, meter = out / "ours.json", Meter(out / "cost.json", study)
     if not file.is_file():
-        store.write_json(file, _cost(ours, min(ours.hierarchy.warm_up + SHORT, total)))
-    path = train(study, METHOD, SEEDS, steps=total, out=folder, callback=meter)
-    count = study.episodes if episodes is None else episodes
-    tests = evaluate_method(study, METHOD, path, count, folder / "tests.json")
-    head = {"study": study.name, "method": METHOD, "sizes": sizes(study)}
-    return head | tests | meter.record() | {"ours": store.read_json(file)}
+        store.write_json(file, _cost(ours, min(ours.hierarchy.warm_up + SHORT, steps)))
+    path = train(study, METHOD, SEEDS, steps=steps, out=out, callback=meter)
+    tests = evaluate_method(study, METHOD, path, episodes, out / "tests.json")
+    named = {"study": study.name, "method": METHOD, "sizes": sizes(study)}
+    return named | tests | meter.record() | {"ours": store.read_json(file)}
 
 
 def _cost(study: TwoLevelStudy, steps: int) -> dict[str, Any]:
