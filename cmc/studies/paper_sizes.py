@@ -36,7 +36,7 @@ SHORT = 20_000
 class Meter:
     """CPU time of a training's learning steps, measured in each session and kept in a file.
 
-    A session is one process. Steps that are done again after a stop count twice, as does their time.
+    A session is one process. Steps that are done again after a stop count twice, with their time.
     """
 
     def __init__(self, path: Path, study: TwoLevelStudy) -> None:
