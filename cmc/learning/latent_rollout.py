@@ -5,6 +5,8 @@ whose coefficients are the controller's own gains: the effect of an action need 
 critic. Segments of that model are unrolled under the actor and the loss is differentiated through
 all ticks. Where the peg is blocked the error stands still and the same reference presses with
 m_eff (K_p e + c u): some axes of some rollouts are blocked, and force beyond a threshold costs.
+Friction and whatever else the model lacks is stood for by a constant push d on each axis, c (u + d)
+in place of c u: without it there is nothing for the integral to do, and it is unlearned.
 The slope cap of the actor holds by construction, so learning cannot leave the stable set.
 """
 
@@ -36,6 +38,7 @@ class LatentConfig:
         force_limit: pressing force that costs nothing, N.
         force_weight: cost of each newton beyond it, in units of the tracking loss.
         effort_weight: cost of u^2 in free motion.
+        disturbance: largest constant push of a rollout on each axis, in units of an action.
         memory: segment starts kept for each seed.
         rotation_scale: radians that count as much as one meter of translation error.
     """
@@ -44,8 +47,9 @@ class LatentConfig:
     batch: int = 64
     blocked: float = 0.2
     force_limit: float = 1.0
-    force_weight: float = 0.5
+    force_weight: float = 0.05
     effort_weight: float = 0.0
+    disturbance: float = 0.25
     memory: int = 4096
     rotation_scale: float = 100.0
 
@@ -139,17 +143,21 @@ class LatentLow:
         starts = self._starts[np.arange(len(drawn))[:, None], drawn]
         blocked = np.stack([g.random((batch, n)) for g in self._generators]) < self.config.blocked
         blocked &= self.model.mass > 0
-        loss = self.loss(torch.from_numpy(starts), torch.from_numpy(blocked))
+        limit = self.config.disturbance
+        pushes = np.stack([g.uniform(-limit, limit, (batch, n)) for g in self._generators])
+        parts = (starts, blocked, pushes.astype(np.float32))
+        loss = self.loss(*(torch.from_numpy(part) for part in parts))
         self.adam.zero_grad()
         loss.sum().backward()
         self.adam.step()
 
-    def loss(self, starts: Tensor, blocked: Tensor) -> Tensor:
+    def loss(self, starts: Tensor, blocked: Tensor, pushes: Tensor) -> Tensor:
         """Mean cost of rollouts, (seeds,).
 
         Args:
             starts: (e, e') of each segment, (seeds, batch, 2n).
             blocked: axes that cannot move, (seeds, batch, n).
+            pushes: constant disturbance of each axis in units of an action, (seeds, batch, n).
         """
         c, config = self._constants, self.config
         e, v = starts.chunk(2, dim=-1)
@@ -166,7 +174,7 @@ class LatentLow:
             u = self.actor(torch.cat([y, integral], dim=-1))
             press = c["mass"] * (c["K_p"] * e + c["action"] * u).abs() * blocked
             step = torch.einsum("...nj,nij->...ni", torch.stack([e, v], -1), self._motion)
-            step = step + self._push * u[..., None]
+            step = step + self._push * (u + pushes)[..., None]
             e = torch.where(blocked, e, step[..., 0])
             v = torch.where(blocked, v, step[..., 1])
             cost = cost + ((e * unit).abs() * free / size).sum(-1)

@@ -29,6 +29,7 @@ from functools import partial
 
 from cmc.envs.peg_maze import JOINT, SOFT, STIFF, PegMaze
 from cmc.learning.hierarchy import HierarchyConfig
+from cmc.learning.latent_rollout import LatentConfig
 from cmc.learning.td3 import TD3Config
 from cmc.studies import two_level_motion, two_level_results, two_level_training
 from cmc.studies.two_level import TwoLevelStudy
@@ -60,7 +61,13 @@ STUDY = TwoLevelStudy(
     joint_task=JOINT,
     joint_aim=(0.4125, -0.0225, 0.010),
 )
-STIFF_STUDY = replace(STUDY, name="peg_maze_stiff", task=STIFF, joint_task=None)
+STIFF_STUDY = replace(
+    STUDY,
+    name="peg_maze_stiff",
+    task=STIFF,
+    latent=LatentConfig(force_weight=0.5),  # pressing forces exceed the limit here
+    joint_task=None,
+)
 
 NAME = STUDY.name
 METHODS = STUDY.methods
