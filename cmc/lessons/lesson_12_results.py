@@ -85,10 +85,10 @@ def by_seed(key: str) -> dict[str, Array]:
     }
 
 
-def distances() -> dict[str, tuple[Array, Array]]:
+def distances(names: list[str]) -> dict[str, tuple[Array, Array]]:
     """By title: smallest and last distance to the target of episodes (or medians of seeds), mm."""
     answer = {}
-    for m in methods().values():
+    for m in (methods()[name] for name in names):
         ends = "_all" if "nearest_mm_all" in m["final"] else ""
         near, far = (np.ravel(m["final"][f"{k}_mm{ends}"]) for k in ("nearest", "final"))
         answer[m["title"]] = (near.astype(float), far.astype(float))
@@ -169,7 +169,7 @@ def table(columns: list[str], rows: list[list[str]]) -> str:
 def method_table() -> str:
     """Markdown: strict touch and return of the last policies of every method."""
     columns = ["method", "steps trained", "seeds x episodes", "touch at the end [95 %]"]
-    columns += ["touch at any time [95 %]", "touch at the end, by seed", "return [range of seeds]"]
+    columns += ["by seed", "touch at any time [95 %]", "touched, then left", "return [range]"]
     longest = max((m["final"]["step"] for m in methods().values()), default=0)
     rows = []
     for m in methods().values():
@@ -181,8 +181,9 @@ def method_table() -> str:
                 steps if test["step"] == longest else f"**{steps}**",
                 f"{len(m['seeds'])} x {test['episodes']}",
                 with_interval(test, "success"),
-                with_interval(test, "touched"),
                 ", ".join(f"{100 * share:.0f}" for share in test["success"]) + " %",
+                with_interval(test, "touched"),
+                percent(float(np.mean(left))) if (left := test.get("passed_by")) else "",
                 span(test["return"], ".0f"),
             ]
         )
