@@ -99,7 +99,7 @@ def slopes(low: LatentLow, offset: int) -> np.ndarray:
 
 def test_pure_tracking_goes_to_the_cap_and_the_integral_needs_a_push():
     study = peg_push.STUDY
-    cap = study.slope_cap()[:3]
+    cap = study.slope_cap("ctd3")[:3]
     alone = trained(study, 200, force_weight=0.0, disturbance=0.0)
     pushed = trained(study, 200, force_weight=0.0, disturbance=0.5)
     assert np.all(slopes(alone, 0) > 0.95 * cap)
@@ -112,4 +112,4 @@ def test_a_price_on_force_lowers_the_slope_of_heavy_axes():
     low = trained(peg_push.STUDY, 200, force_weight=1.0)
     x, y, z = slopes(low, 0)
     assert z < y < x  # in the order of the masses
-    assert z < 0.5 * peg_push.STUDY.slope_cap()[2]
+    assert z < 0.5 * peg_push.STUDY.slope_cap("ctd3")[2]

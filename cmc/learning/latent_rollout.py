@@ -39,6 +39,8 @@ class LatentConfig:
         force_weight: cost of each newton beyond it, in units of the tracking loss.
         effort_weight: cost of u^2 in free motion.
         disturbance: largest constant push of a rollout on each axis, in units of an action.
+        cap: what (K_d + g K2) dt is kept below by construction: below 1 an error does not change
+            sides from tick to tick, which in contact is felt well before chatter starts at 2.
         memory: segment starts kept for each seed.
         rotation_scale: radians that count as much as one meter of translation error.
     """
@@ -47,9 +49,10 @@ class LatentConfig:
     batch: int = 64
     blocked: float = 0.2
     force_limit: float = 1.0
-    force_weight: float = 0.05
+    force_weight: float = 0.2
     effort_weight: float = 0.0
     disturbance: float = 0.25
+    cap: float = 1.0
     memory: int = 4096
     rotation_scale: float = 100.0
 

@@ -83,7 +83,8 @@ class TwoLevelStudy:
         planner_hidden: hidden sizes (our choice; the paper's are 400, 300).
         low_hidden: hidden sizes for each dimension (our choice; the paper's are 200, 200).
         start_gain: slope in y that constrained low levels start from, below the cap.
-        cap: what (K_d + g K2) dt is kept below by construction; chatter starts at 2.
+        cap: what (K_d + g K2) dt is kept below by construction; chatter starts at 2. Learning
+            through the latent model has a lower one of its own.
         mass: effective mass of the tip in x, y, z at the start, kg.
         steps: environment steps of each seed.
         snapshot_every: steps between two kept policies.
@@ -171,10 +172,11 @@ class TwoLevelStudy:
         tool = FINGERTIP + self.task.peg.length
         return inverse_kinematics(self.joint_aim, tool=tool, q0=start_joints(self.task))
 
-    def slope_cap(self) -> Array:
-        """Largest slope d pi / dy that keeps (K_d + g K2) dt below the cap, (6,)."""
+    def slope_cap(self, method: str = "frozen") -> Array:
+        """Largest slope d pi / dy that keeps (K_d + g K2) dt below a method's cap, (6,)."""
         latent = self.task.gains.latent
-        room = self.cap / self.task.tick - latent.K_d
+        cap = self.latent.cap if self.method(method).low == "latent" else self.cap
+        room = cap / self.task.tick - latent.K_d
         return room / (latent.K2 * np.array(self.task.u_limit))
 
 

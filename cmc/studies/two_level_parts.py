@@ -82,7 +82,7 @@ def build_low(study: TwoLevelStudy, name: str, seeds: Sequence[int]) -> LowLevel
         return Fixed(None, N)
     if arm.low == "hiro":
         return _joint_low(study, arm, seeds)
-    cap = study.slope_cap()
+    cap = study.slope_cap(name)
     start = np.minimum(study.start_gain, 0.99 * cap)
     if arm.low == "gain":
         return Fixed(ModularActor(Gain(start), N), N)

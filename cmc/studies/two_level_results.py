@@ -158,7 +158,7 @@ def _test(
     if here.task.command == "pose" and not silent:
         figures["gains"] = {
             "slope": slope_at_rest(here, low, seeds).tolist(),
-            "bound": here.slope_cap().tolist(),
+            "bound": here.slope_cap(name).tolist(),
             "bounded": study.method(name).capped and study.method(name).positive,
         }
     return {"step": mark, **figures}
