@@ -49,7 +49,7 @@ def learn_low(
     low, seen = (_starting(replace(study, latent=rates), start) for _ in range(2))
     low.record(_starts(np.random.default_rng(0)))
     count = (budget(240, 110) if force_weight else budget(60, 30)) if updates is None else updates
-    share, limit, net = [], study.slope_cap()[:3], _net(low)
+    share, limit, net = [], study.slope_cap("ctd3")[:3], _net(low)
     with single_thread():
         for k in range(count + 1):
             share.append(net.slope_bounds()[1][0, :3, 0] / limit)
@@ -77,7 +77,7 @@ def learn_low(
 def _starting(study: TwoLevelStudy, start: float) -> LatentLow:
     low = build_low(study, "ctd3", [0])
     assert isinstance(low, LatentLow)
-    set_gain(_net(low), start * study.slope_cap())
+    set_gain(_net(low), start * study.slope_cap("ctd3"))
     return low
 
 
@@ -127,7 +127,7 @@ def train_both(show: Show | None = None, steps: int | None = None, seed: int = 0
                 found[name].append(-MM * float(trainer.segment()[0]))
             found["step"].append(trainers["ctd3"].steps)
             bound = _net(trainers["ctd3"].low).slope_bounds()[1][0, 0, 0]
-            found["share"].append(float(bound / study.slope_cap()[0]))
+            found["share"].append(float(bound / study.slope_cap("ctd3")[0]))
             if show is not None:
                 show(found["step"][-1], found["ctd3"][-1], found["control"][-1])
     return {name: np.array(values) for name, values in found.items()}

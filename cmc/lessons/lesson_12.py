@@ -22,8 +22,8 @@ STEP = 0.005
 PLAN = np.array([(9.5, 4), (9.5, -3), (-5.1, -3), (3, -3), (3, -12.5), (0, -12.5)]) * 1e-3
 """A way to the target, tip (y, z) from the box's top, m: down, push the lid, enter, push, touch."""
 LATENT = PUSH.gains.latent
-CAP = float(peg_push.STUDY.slope_cap()[0])
-"""Largest slope of a capped low level in translation, 1/(m/s^2)."""
+CAP = float(peg_push.STUDY.slope_cap("ctd3")[0])
+"""Largest slope of the learned, capped low level in translation, 1/(m/s^2)."""
 
 
 def low_level(gain: Array, y: Array, integral: Array) -> Array:
@@ -33,7 +33,7 @@ def low_level(gain: Array, y: Array, integral: Array) -> Array:
 
 
 def level(gain: float) -> float:
-    """(K_d + g K2) dt of a translation axis; a held command chatters from 2 on."""
+    """(K_d + g K2) dt of a translation axis: from 1 on y swings, from 2 on the command chatters."""
     return float((LATENT.K_d[0] + gain * LATENT.K2[0]) * PUSH.tick)
 
 
@@ -87,7 +87,7 @@ def segment(gain: float, ticks: int = 20, integral: bool = True) -> dict[str, An
         held = -(K_p * e + K_d * v + u)  # 2nd_sys
         e, v = e + dt * v + 0.5 * dt**2 * held, v + dt * held
     share = 100.0 * (1.0 - np.array(errors) / STEP)
-    verdict = "chatters" if level(gain) > 2.0 else "calm"
+    verdict = "chatters" if level(gain) > 2.0 else "swings" if level(gain) > 1.0 else "calm"
     return {
         "t": 1e3 * dt * np.arange(51),
         "share": share,
