@@ -35,7 +35,7 @@ def test_tracking_gets_cheaper_up_to_the_cap_and_chatter_comes_after_it():
     for regime in lesson_11.STUDIES:
         assert (np.diff(cost[regime][below]) < 0).all()
         rest = cost[regime][~below]
-        assert cost[regime][below][-1] - rest.min() < 0.05 * cost[regime][below][-1]
+        assert cost[regime][below][-1] - rest.min() < 0.1 * cost[regime][below][-1]
     calm, wild = (lesson_11.gain_step(bound["chatter"] * f, "x", "stiff")["u"] for f in (0.8, 1.3))
     assert (np.diff(np.sign(wild[-8:])) != 0).all()
     assert np.abs(calm[-8:]).max() < 0.2 < np.abs(wild[-8:]).min()
@@ -64,7 +64,7 @@ def test_tracking_alone_drives_the_slopes_to_the_cap():
 
 
 def test_a_force_threshold_lowers_the_saturation_and_keeps_the_slope():
-    out = lesson_11_learning.learn_low(force_weight=1.0, start=0.99, updates=150)
+    out = lesson_11_learning.learn_low(force_weight=1.0, start=0.99, updates=90)
     first, last = (np.abs(out[key][-1]) for key in ("before", "after"))
     assert (last < 0.6 * first).all()
     assert (out["share"][-1] > 0.95).all()
@@ -215,7 +215,7 @@ def test_gains_are_judged_by_sign_and_bound(written):
     written({"ctd3": made_up([1.0, 1.0], slope=0.99)})
     assert "all 12 slopes at rest are positive, the largest is 0.99" in verdicts.gain_verdict()
     written({"ctd3": made_up([1.0, 1.0], slope=1.5)})
-    assert "12 exceed the bound" in verdicts.gain_verdict()
+    assert "12 exceed their bound" in verdicts.gain_verdict()
     written({"ctd3": made_up([1.0, 1.0], slope=-0.002)})
     text = verdicts.gain_verdict()
     assert "12 of 12 slopes at rest have the wrong sign" in text
@@ -279,12 +279,16 @@ def test_learning_curves_average_over_whole_episodes(written):
 def test_the_paper_sizes_are_shown_where_they_are_shipped(monkeypatch, tmp_path):
     assert isinstance(verdicts.paper_sizes(), dict)
     path = tmp_path / "peg_maze_paper_sizes.json"
-    curve = {"step": [10, 20], "reward": [[-0.01], [-0.005]]}
-    store.write_json(path, {"cost": {"ms_a_step": 1.25}, "methods": {"ctd3": {"training": curve}}})
+    found = made_up([0.97])
+    found |= {"sizes": {"planner": [400, 300]}, "cpu_ms_per_step": 3.0}
+    found["ours"] = {"sizes": {"planner": [128, 128]}, "cpu_ms_per_step": 1.2}
+    store.write_json(path, found)
     monkeypatch.setattr(store, "asset", lambda *parts: path)
     out = verdicts.paper_sizes()
-    assert "ms a step: 1.25" in out["text"]
-    np.testing.assert_allclose(out["distance"], [[10.0, 5.0]])
+    assert "costs 2.5 times as much" in out["text"]
+    assert "planner 400, 300): 3.00 ms" in out["text"]
+    assert "97.0%" in out["text"]
+    np.testing.assert_allclose(out["distance"], [[10.0] * 7, [20.0] * 7])
 
 
 def test_shipped_results_fill_every_figure_and_table():

@@ -75,12 +75,12 @@ def _tick(task: PandaTask, low: LowLevel, obs: Array) -> tuple[Array, dict[str, 
 
 
 def cap(regime: str = "soft") -> dict[str, float]:
-    """Slopes du/dy of the translation: the library's cap, and where chatter is predicted."""
+    """Slopes du/dy of the translation: caps of the learned and of other low levels, and chatter."""
     study = STUDIES[regime]
     latent, tick = study.task.gains.latent, study.task.tick
+    levels = {"cap": study.latent.cap, "others": study.cap, "chatter": 2.0}
     return {
-        "cap": float((study.cap / tick - latent.K_d[0]) / latent.K2[0]),
-        "chatter": float((2.0 / tick - latent.K_d[0]) / latent.K2[0]),
+        name: float((level / tick - latent.K_d[0]) / latent.K2[0]) for name, level in levels.items()
     }
 
 

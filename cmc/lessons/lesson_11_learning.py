@@ -45,10 +45,10 @@ def learn_low(
         `low`, and `seen`, what it was before.
     """
     study = STUDIES[regime]
-    rates = replace(study.latent, force_weight=force_weight, rate=2e-2, batch=32)
+    rates = replace(study.latent, force_weight=force_weight, rate=2e-2, batch=32, blocked=0.4)
     low, seen = (_starting(replace(study, latent=rates), start) for _ in range(2))
     low.record(_starts(np.random.default_rng(0)))
-    count = (budget(240, 110) if force_weight else budget(60, 30)) if updates is None else updates
+    count = (budget(200, 90) if force_weight else budget(60, 30)) if updates is None else updates
     share, limit, net = [], study.slope_cap("ctd3")[:3], _net(low)
     with single_thread():
         for k in range(count + 1):

@@ -55,18 +55,20 @@ def training(names: list[str], regime: str = "soft") -> dict[str, tuple[Array, A
     All worlds of a seed start their episodes together, so that raw curves show the time within an
     episode; this is the moving average over about a whole number of episodes.
     """
-    answer = {}
-    for name in names:
-        found = methods(regime)[name]
-        step = np.array(found["training"]["step"], dtype=float)
-        distance = -1e3 * np.array(found["training"]["reward"], dtype=float).T
-        width = _window(step[0]) if len(step) > 1 else 1
-        if width < len(step):
-            kernel = np.ones(width) / width
-            distance = np.array([np.convolve(row, kernel, "valid") for row in distance])
-            step = np.convolve(step, kernel, "valid")
-        answer[found["title"]] = (step, distance)
-    return answer
+    found = (methods(regime)[name] for name in names)
+    return {m["title"]: averaged(m["training"]) for m in found}
+
+
+def averaged(training: dict[str, Any]) -> tuple[Array, Array]:
+    """A stored learning curve, averaged over episodes; see `training`."""
+    step = np.array(training["step"], dtype=float)
+    distance = -1e3 * np.array(training["reward"], dtype=float).T
+    width = _window(step[0]) if len(step) > 1 else 1
+    if width < len(step):
+        kernel = np.ones(width) / width
+        distance = np.array([np.convolve(row, kernel, "valid") for row in distance])
+        step = np.convolve(step, kernel, "valid")
+    return step, distance
 
 
 def _window(spacing: float, longest: int = 12) -> int:

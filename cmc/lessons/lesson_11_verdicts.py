@@ -12,6 +12,7 @@ from cmc.lessons.lesson_11_results import (
     FILES,
     PAPER,
     PAPER_STEPS,
+    averaged,
     gain_shares,
     measured,
     methods,
@@ -165,7 +166,7 @@ def gain_verdict() -> str:
             text += (
                 f", the largest is {share.max():.2f} of its bound"
                 if share.max() <= 1.0
-                else f", {int((share > 1.0).sum())} exceed the bound (largest {share.max():.2f})"
+                else f", {int((share > 1.0).sum())} exceed their bound (largest {share.max():.2f})"
             )
             lines.append(text + ".")
     return "\n\n".join(lines)
@@ -220,10 +221,17 @@ def paper_sizes() -> dict[str, Any]:
         found = store.read_json(store.asset("results", "peg_maze_paper_sizes.json"))
     except FileNotFoundError:
         return {}
-    method = next(iter(found["methods"].values())) if found.get("methods") else found
-    curve = method.get("training", {"step": [], "reward": []})
-    reward = np.atleast_2d(np.array(curve["reward"], dtype=float).T)
-    cost = {k: v for k, v in {**found, **found.get("cost", {})}.items() if isinstance(v, float)}
-    lines = [f"- {key.replace('_', ' ')}: {value:.3g}" for key, value in cost.items()]
-    text = "At the paper's network sizes, one seed:\n\n" + "\n".join(lines)
-    return {"text": text, "step": np.array(curve["step"], float), "distance": -1e3 * reward}
+    ours, words = found["ours"], []
+    for name, part in (("the paper's", found), ("ours", ours)):
+        sizes = "; ".join(f"{k} {', '.join(map(str, v))}" for k, v in part["sizes"].items())
+        words.append(f"- {name} ({sizes}): {part['cpu_ms_per_step']:.2f} ms of CPU a step")
+    ratio = found["cpu_ms_per_step"] / ours["cpu_ms_per_step"]
+    final = found["final"]
+    text = (
+        f"One seed at the paper's network sizes costs {ratio:.1f} times as much:\n\n"
+        + "\n".join(words)
+        + f"\n\nAfter {final['step']:,} steps it succeeds in {with_interval(final)} of "
+        f"{final['episodes']} episodes."
+    )
+    step, distance = averaged(found["training"])
+    return {"text": text, "step": step, "distance": distance}
