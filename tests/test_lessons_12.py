@@ -35,10 +35,15 @@ def test_slider_agrees_with_the_arm(gain):
 
 
 def test_slider_says_when_a_command_chatters():
-    edge = (2.0 / PUSH.tick - 30.0) / peg_push.STUDY.task.gains.latent.K2[0]
-    assert "calm" in lesson_12.segment(0.98 * edge)["text"]
-    assert "chatters" in lesson_12.segment(1.02 * edge)["text"]
-    assert lesson_12.level(lesson_12.CAP) == pytest.approx(peg_push.STUDY.cap)
+    K2 = peg_push.STUDY.task.gains.latent.K2[0]
+    for level, words in ((1.0, ("calm", "swings")), (2.0, ("swings", "chatters"))):
+        edge = (level / PUSH.tick - 30.0) / K2
+        for part, word in zip((0.98, 1.02), words, strict=True):
+            assert word in lesson_12.segment(part * edge)["text"]
+    tail = [np.diff(np.sign(lesson_12.segment(g, integral=False)["u"])) for g in (20.0, 150.0)]
+    assert not tail[0].any()
+    assert np.abs(tail[1][20:]).sum() > 20  # every other tick another sign
+    assert lesson_12.level(lesson_12.CAP) == pytest.approx(peg_push.STUDY.latent.cap)
     assert lesson_12.segment(2.0, ticks=50)["due"] == pytest.approx(1000.0)
     more, less = (lesson_12.segment(2.0, integral=i)["share"][20] for i in (True, False))
     assert more > less

@@ -148,14 +148,14 @@ def live_training(
         show: called after each segment with the environment steps and both rewards a tick, times
             the ticks of an episode, averaged over the last segments.
         names: two methods.
-        steps: environment steps of each; 20,000, or 1600 in fast mode.
+        steps: environment steps of each; 12,000, or 1600 in fast mode.
         warm_up: steps with random sub-goals, fewer than the study's.
 
     Returns:
         `step` (K,) and, by method, rewards of each segment as a return (K,); `ticks` of an episode,
         `worlds`, `warm_up`.
     """
-    wanted = budget(20_000, 1600) if steps is None else steps
+    wanted = budget(12_000, 1600) if steps is None else steps
     study = peg_push.STUDY
     study = replace(study, hierarchy=replace(study.hierarchy, warm_up=warm_up))
     trainers = {name: build(study, name, [0]) for name in names}

@@ -14,6 +14,7 @@ from scipy.special import stdtrit
 
 from cmc import store
 from cmc.envs.peg_push import PUSH
+from cmc.lessons.lesson_11_results import percent, span, with_interval
 
 Array = NDArray[np.float64]
 Method = dict[str, Any]
@@ -139,25 +140,6 @@ def difference(a: Any, b: Any, level: float = 0.95) -> tuple[float, float, float
 def thousands(step: int) -> str:
     """Steps of training, short."""
     return f"{step / 1e6:g}M" if step >= 1_000_000 else f"{step / 1e3:g}k"
-
-
-def percent(share: float) -> str:
-    """A share in percent, with as many digits as it takes to tell it from 0 or 100 %."""
-    if share in (0.0, 1.0):
-        return f"{100 * share:.0f} %"
-    return f"{100 * share:.2f} %" if min(share, 1 - share) < 0.01 else f"{100 * share:.1f} %"
-
-
-def with_interval(test: dict[str, Any], key: str) -> str:
-    """A share over all episodes with its exact interval."""
-    low, high = test[f"{key}_interval"]
-    return f"{percent(float(np.mean(test[key])))} [{100 * low:.1f}, {100 * high:.1f}]"
-
-
-def span(values: Any, form: str = ".2f") -> str:
-    """Mean of some numbers and their range."""
-    v = np.asarray(values, dtype=float)
-    return f"{v.mean():{form}} [{v.min():{form}}, {v.max():{form}}]"
 
 
 def table(columns: list[str], rows: list[list[str]]) -> str:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cmc.lessons.lesson_11_results import percent, with_interval
 from cmc.lessons.lesson_12_results import (
     FAR,
     NEAR,
@@ -19,11 +20,9 @@ from cmc.lessons.lesson_12_results import (
     mean_interval,
     methods,
     passing,
-    percent,
     stiffness,
     table,
     thousands,
-    with_interval,
 )
 
 LEARNED, BETTER = -400.0, -200.0
