@@ -176,7 +176,7 @@ def three_ways(segments: int | None = None, seeds: Sequence[int] = (0, 1)) -> di
     Each is the study's own, with its own exploration and its own number of updates.
 
     Args:
-        segments: of each of 8 worlds; 120, or 8 in fast mode.
+        segments: of each of 8 worlds; 160, or 8 in fast mode.
         seeds: one training each.
 
     Returns:
@@ -186,7 +186,7 @@ def three_ways(segments: int | None = None, seeds: Sequence[int] = (0, 1)) -> di
         translation; and for those with a critic `agreement` (seeds,): share of visited states
         and axes in which dQ/du has the sign of the exact effect, after training.
     """
-    count = budget(120, 8) if segments is None else segments
+    count = budget(160, 8) if segments is None else segments
     marks = sorted({0, *np.linspace(0, count, 9).astype(int).tolist()})
     answer: dict[str, Any] = {}
     with single_thread():
