@@ -71,12 +71,14 @@ def averaged(training: dict[str, Any]) -> tuple[Array, Array]:
     return step, distance
 
 
-def _window(spacing: float, longest: int = 12) -> int:
-    """How many points, that many steps apart, come closest to whole episodes of all worlds."""
+def _window(spacing: float, longest: int = 12, tolerance: float = 0.03) -> int:
+    """The fewest points, that many steps apart, that nearly cover whole episodes of all worlds."""
     episode = STUDY.task.ticks * STUDY.hierarchy.worlds
-    widths = np.arange(1, longest + 1)
-    whole = np.maximum(np.round(widths * spacing / episode), 1)
-    return int(widths[np.argmin(np.abs(widths * spacing / (whole * episode) - 1))])
+    covered = np.arange(1, longest + 1) * spacing / episode
+    whole = np.maximum(np.round(covered), 1)
+    wrong = np.abs(covered / whole - 1)
+    near = np.flatnonzero(wrong <= tolerance)
+    return 1 + int(near[0] if near.size else np.argmin(wrong))
 
 
 def success(names: list[str], regime: str = "soft") -> dict[str, tuple[Array, Array, Array, Array]]:
