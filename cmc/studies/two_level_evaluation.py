@@ -45,7 +45,12 @@ class Episodes:
 
 
 def run_episodes(
-    study: TwoLevelStudy, planner: nn.Module, low: LowLevel, seeds: int, episodes: int
+    study: TwoLevelStudy,
+    planner: nn.Module,
+    low: LowLevel,
+    seeds: int,
+    episodes: int,
+    start: int = TEST_SEED,
 ) -> Episodes:
     """Run deterministic test episodes of all seeds side by side.
 
@@ -55,8 +60,9 @@ def run_episodes(
         low: the low level.
         seeds: how many trained seeds S the networks hold.
         episodes: test episodes of each.
+        start: seed of the first test world.
     """
-    task = study.task_class(study.task, num=seeds * episodes, seed=TEST_SEED)
+    task = study.task_class(study.task, num=seeds * episodes, seed=start)
     planning, limit = study.planning(), np.array(study.task.u_limit)
     obs = task.reset()
     shape = (seeds, episodes)
