@@ -8,7 +8,7 @@ from scipy import stats
 
 from cmc import store
 from cmc.envs.peg_push import BOX_TOP, PUSH, TARGET
-from cmc.lessons import lesson_12, lesson_12_critic, lesson_12_episodes
+from cmc.lessons import lesson_12, lesson_12_critic, lesson_12_episodes, lesson_12_picked
 from cmc.lessons import lesson_12_results as shipped
 from cmc.lessons import lesson_12_verdicts as verdicts
 from cmc.studies import peg_push, two_level_training
@@ -458,3 +458,18 @@ def test_stiffness_is_judged_seed_by_seed(monkeypatch):
     assert shipped.stiffness_table().count("\n| ") == 3
     found.clear()
     assert "No stiffness sweep" in shipped.stiffness_table() + verdicts.stiffness_verdict()
+
+
+@pytest.mark.parametrize(
+    ("touched", "depth", "met"), [(0.95, 0.1, 1), (0.85, 0.1, 0), (0.95, 0.3, 0)]
+)
+def test_picked_policies_are_judged_on_their_fresh_episodes(monkeypatch, touched, depth, met):
+    seeds = [touched] * 4 + [0.0]
+    found = {"title": "ours", "picked": [1000] * 5, "touched": seeds, "success": seeds}
+    found |= {"touched_interval": [0.5, 0.9], "success_interval": [0.5, 0.9]}
+    found["penetration_mm"] = [depth] * 5
+    monkeypatch.setattr(lesson_12_picked, "picked", lambda: {"ctd3": found})
+    assert lesson_12_picked.picked_verdict().count("**met**") == met
+    assert f"{100 * touched:.0f} · " in lesson_12_picked.picked_table()
+    monkeypatch.setattr(lesson_12_picked, "picked", dict)
+    assert lesson_12_picked.picked_table() == lesson_12_picked.picked_verdict()
