@@ -11,7 +11,8 @@ What the paper gives is in `cmc.envs.peg_maze` and in the table `tab:my_label`. 
 5. Critics have 128, 128 units.
 6. Low level: a segment ends its return, in every method. The paper's scheme has biases, no cap, a
    critic that sees (y, integral of y), reward in meters and radians, and noise 0.1. Ours has no
-   biases, slopes capped by construction, and learns through the latent model. Corrected critics see
+   biases, slopes capped by construction, and learns through the latent model under constant pushes,
+   with a price on force beyond 1 N (higher in the stiff regime). Corrected critics see
    the full state and the return as it came, in centimeters and radians, with noise 0.5.
 7. HIRO plans joint increments for a rigid peg under a hood, its planner sees the joints too, and
    its low level has two hidden layers of 64 units for all joints. Noise is 1.0 in half-ranges (the
