@@ -122,7 +122,8 @@ def main(arguments: Iterable[str] | None = None) -> None:
     for method in found.values():
         shares = ", ".join(f"{100 * share:.0f}" for share in method["touched"])
         print(f"{method['title']}: steps {method['picked']}, strict touch in {shares} %")
-    made = store.provenance("python -m cmc.studies.selection", [*range(5)])
+    command = f"python -m cmc.studies.selection --method {' '.join(found)}"
+    made = store.provenance(command, [*range(5)])
     content = {"study": STUDY.name, "episodes": chosen.episodes, "methods": found, **made}
     store.write_json(chosen.write or Path("assets/results/peg_push_selected.json"), content)
 
