@@ -39,7 +39,7 @@ def test_every_result_has_its_policies_and_their_record(study, name):
     assert found["final"]["step"] == steps[-1] == marks(studies.get(study).STUDY, name, path)[-1]
     assert found["final"]["episodes"] >= 100
     curve = np.array(found["training"]["reward"]).mean(0)
-    np.testing.assert_allclose(curve, tensors["rewards"].mean(0), rtol=0.02)
+    np.testing.assert_allclose(curve, tensors["rewards"].mean(0), rtol=0.1)
 
 
 @pytest.mark.parametrize(("study", "name"), cases())
