@@ -203,7 +203,7 @@ def consistency_table() -> str:
         found, gains = m["final"]["consistency_mm"], m["final"].get("gains")
         late = m.get("consistency_over_training_mm")
         cells = [found.get("mean"), found.get("spread"), found.get("pushed"), late]
-        row = [m["title"], *("" if c is None else span(c, ".2g") for c in cells)]
+        row = [m["title"], *("" if c is None else span(np.round(c, 6), ".2g") for c in cells)]
         if gains is None:
             rows.append([*row, "no low level", "", ""])
             continue
