@@ -20,6 +20,7 @@ from tornado.websocket import websocket_connect
 from cmc.view.playback import Arrow, Camera, Marker, around, notebook, record
 from cmc.view.playback.cameras import FIELD_OF_VIEW
 from cmc.view.playback.geometry import color, geom_mesh
+from cmc.view.playback.overlays import as_overlays
 from cmc.view.playback.page import scene_data, scene_id
 
 SCENE = """
@@ -425,3 +426,16 @@ def test_live_view_answers_no_foreign_host_or_origin(model):
 
         with pytest.raises(HTTPClientError, match="403"):
             asyncio.run(knock())
+
+
+def test_markers_without_a_color_get_different_ones():
+    points = np.zeros((4, 3))
+    given = {
+        "goal": Marker("goal", points),
+        "way": Marker("way", points),
+        "own": Marker("o", points, 7),
+    }
+    colors = [overlay.color for overlay in as_overlays(4, given, {})]
+    assert None not in colors
+    assert len(set(colors)) == 3
+    assert colors[2] == 7

@@ -27,11 +27,11 @@ class Trail:
 
 @dataclass(frozen=True)
 class Marker:
-    """A see-through ball at (T, 3) or (3,), m; rows of NaN hide it."""
+    """A see-through ball at (T, 3) or (3,), m; rows of NaN hide it; None: the next free color."""
 
     name: str
     points: Array
-    color: int = ORANGE
+    color: int | None = None
     radius: float = 0.002
 
 
@@ -77,9 +77,10 @@ def as_overlays(
     """
     out: list[Overlay] = []
     for i, (name, given) in enumerate(markers.items()):
-        color = _MARKER_COLORS[i % len(_MARKER_COLORS)]
-        marker = given if isinstance(given, Marker) else Marker(name, np.asarray(given), color)
-        out.append(Marker(name, _rows(name, marker.points, frames), marker.color, marker.radius))
+        marker = given if isinstance(given, Marker) else Marker(name, np.asarray(given))
+        free = _MARKER_COLORS[i % len(_MARKER_COLORS)]
+        color = free if marker.color is None else marker.color
+        out.append(Marker(name, _rows(name, marker.points, frames), color, marker.radius))
     for name, arrow in arrows.items():
         points, vectors = (_rows(name, a, frames) for a in (arrow.points, arrow.vectors))
         if not (np.isfinite(points).all() and np.isfinite(vectors).all()):
