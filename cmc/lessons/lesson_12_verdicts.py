@@ -102,20 +102,30 @@ def parts_table() -> str:
 
 
 def parts_verdict() -> str:
-    """Markdown: which parts help, hurt, or show nothing, on strict touch at the end."""
-    found: dict[str, list[str]] = {"helps": [], "hurts": [], "not shown": []}
-    for part in PARTS:
-        if part.arm in methods() and part.other in methods():
-            tests = common(methods()[part.arm], methods()[part.other])
-            if tests is not None:
-                gap = difference(tests[0]["success"], tests[1]["success"])
-                found[word(*gap[1:])].append(part.bought)
-    heads = {
-        "helps": "On strict touch, these help",
-        "hurts": "These hurt",
-        "not shown": "Not shown either way, with this many seeds",
+    """Markdown: which parts help, hurt, or show nothing, measure by measure."""
+    measures = {
+        "success": "a touch at the end",
+        "touched": "a touch at any time",
+        "return": "return",
     }
-    lines = [f"- {heads[key]}: {'; '.join(names)}." for key, names in found.items() if names]
+    pairs = [p for p in PARTS if p.arm in methods() and p.other in methods()]
+    lines = []
+    for key, name in measures.items():
+        found: dict[str, list[str]] = {"help": [], "hurt": []}
+        compared = 0
+        for part in pairs:
+            tests = common(methods()[part.arm], methods()[part.other])
+            if tests is None:
+                continue
+            compared += 1
+            verdict = word(*difference(*(test[key] for test in tests))[1:])
+            if verdict != "not shown":
+                found[verdict.removesuffix("s")].append(part.bought)
+        if compared:
+            said = [f"these {end}: {'; '.join(names)}" for end, names in found.items() if names]
+            rest = compared - sum(len(names) for names in found.values())
+            said.append(f"not shown either way with this many seeds: {rest} of {compared} parts")
+            lines.append(f"- On {name}: {' · '.join(said)}.")
     return "\n".join(lines) if lines else "The file holds no two arms to compare."
 
 
