@@ -7,9 +7,9 @@ What the paper gives is in `cmc.envs.peg_push` and in the table `tab:para`. Devi
 2. Eight worlds of each seed; updates are spread over the segments (100 for 1024 steps).
 3. The planner's rates are 1e-3 and its targets move at every update; its noise falls from 0.3 to
    0.05 half-ranges in 500,000 steps (the table's is below a micrometer), and that of its target
-   actions is 0.05: at 0.3 and 0.2, which are 1.5 mm and 1 mm, planners learn to stand on the floor
-   beside the target, since hovering over it is finer than their noise. 10,000 steps of random
-   sub-goals come first; rewards are means over a segment.
+   actions is 0.05: 0.3 and 0.2 are 1.5 mm and 1 mm, coarser than the touch. (Some planners rest on
+   the floor beside the target all the same.) 10,000 steps of random sub-goals come first; rewards
+   are means over a segment.
 4. Critics have 128, 128 units.
 5. Low level: as in the maze (`cmc.studies.peg_maze`, 6); PPO/Control as there (8).
 """
