@@ -96,9 +96,9 @@ class TD3:
         )
         self.target_actor = copy.deepcopy(actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.actor_adam = torch.optim.Adam(actor.parameters(), config.actor_rate, foreach=True)
+        self.actor_adam = torch.optim.Adam(actor.parameters(), config.actor_rate, fused=True)
         self.critic_adam = torch.optim.Adam(
-            self.critics.parameters(), config.critic_rate, foreach=True
+            self.critics.parameters(), config.critic_rate, fused=True
         )
         self.updates = 0
         self._generators = [np.random.default_rng([seed, stream, 13]) for seed in seeds]

@@ -12,6 +12,8 @@ from torch import Tensor, nn
 from cmc.policies.fast_tanh import tanh
 
 Start = Literal["positive", "signed"]
+NARROW = 16
+"""Columns below which a product is computed from the transposes."""
 
 
 def check_seeds(seeds: Sequence[int] | None) -> tuple[int, ...] | None:
@@ -118,10 +120,19 @@ def _layers(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> l
     """Values after every layer, by ordinary differentiable operations."""
     values: list[Tensor] = []
     for layer, weight in enumerate(weights):
-        x = torch.baddbmm(biases[layer], x, weight) if biases else torch.bmm(x, weight)
+        x = _product(x, weight, biases[layer] if biases else None)
         x = tanh(x) if layer < len(weights) - 1 else x
         values.append(x)
     return values
+
+
+def _product(x: Tensor, y: Tensor, shift: Tensor | None = None) -> Tensor:
+    """x y + shift; with a narrow y by its transpose, several times faster in batched products."""
+    if y.shape[-1] < NARROW:
+        x, y = y.transpose(1, 2), x.transpose(1, 2)
+        shift = None if shift is None else shift.transpose(1, 2)
+        return (torch.bmm(x, y) if shift is None else torch.baddbmm(shift, x, y)).transpose(1, 2)
+    return torch.bmm(x, y) if shift is None else torch.baddbmm(shift, x, y)
 
 
 class _Network(torch.autograd.Function):
@@ -151,7 +162,7 @@ class _Network(torch.autograd.Function):
         to_biases: list[Tensor | None] = [None] * len(biases)
         for layer in range(depth - 1, -1, -1):
             if wanted[2 + layer]:
-                to_weights[layer] = torch.bmm(values[layer].transpose(1, 2), slope)
+                to_weights[layer] = _product(values[layer].transpose(1, 2), slope)
             if biases and wanted[2 + depth + layer]:
                 to_biases[layer] = slope.sum(1, keepdim=True)
             if layer > 0 or wanted[0]:
