@@ -431,38 +431,6 @@ def test_passing_by_needs_to_come_near_and_to_leave():
     assert shipped.passing({}) is None
 
 
-def stiff(success, title):
-    """Cells of one method at three stiffnesses, in the order of the time constants."""
-    cells = [
-        {
-            "scale": 1.0 / np.sqrt(k),
-            "stiffness": k,
-            "time_constant_ms": 10.0 / np.sqrt(k),
-            "success": [s, s + 0.02, s - 0.02],
-            "success_interval": [0.0, 1.0],
-            "return": [-100.0] * 3,
-            "penetration_mm": [0.1 / k] * 3,
-        }
-        for k, s in zip((4.0, 1.0, 0.25), success, strict=True)
-    ]
-    return {"title": title, "step": 1_000_000, "seeds": [0, 1, 2], "cells": cells}
-
-
-def test_stiffness_is_judged_seed_by_seed(monkeypatch):
-    found = {"ctd3": stiff((0.5, 0.9, 0.9), "ours")}
-    for module in (shipped, verdicts):
-        monkeypatch.setattr(module, "stiffness", lambda: found)
-    stiffer, softer = verdicts.stiffness_verdict().splitlines()
-    assert "4 times as stiff: **fewer touches**" in stiffer
-    assert "0.25 times as stiff: **no difference shown**" in softer
-    x, share = shipped.stiffness_curves()["ours"]
-    assert x.tolist() == [0.25, 1.0, 4.0]
-    assert share.shape == (3, 3)
-    assert shipped.stiffness_table().count("\n| ") == 3
-    found.clear()
-    assert "No stiffness sweep" in shipped.stiffness_table() + verdicts.stiffness_verdict()
-
-
 @pytest.mark.parametrize(
     ("touched", "depth", "met"), [(0.95, 0.1, 1), (0.85, 0.1, 0), (0.95, 0.3, 0)]
 )

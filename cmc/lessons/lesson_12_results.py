@@ -38,17 +38,6 @@ def methods() -> dict[str, Method]:
     return found
 
 
-@cache
-def stiffness() -> dict[str, Method]:
-    """Answers of every method under other contact stiffness; none if no result is shipped."""
-    try:
-        path = store.asset("results", "peg_push_stiffness.json")
-    except FileNotFoundError:
-        return {}
-    found: dict[str, Method] = store.read_json(path)["methods"]
-    return found
-
-
 def groups() -> list[list[str]]:
     """Names of the methods that are there, in the groups of the figures; no empty group."""
     known = [[name for name in group if name in methods()] for group in GROUPS]
@@ -211,33 +200,3 @@ def consistency_table() -> str:
         bounded = "yes" if gains["bounded"] else "no"
         rows.append([*row, span(share[:, :3]), span(share[:, 3:]), bounded])
     return table(columns, rows)
-
-
-def stiffness_curves(key: str = "success") -> dict[str, tuple[Array, Array]]:
-    """By title: relative contact stiffness (cells,), and a figure of each cell (seeds, cells)."""
-    answer = {}
-    for m in stiffness().values():
-        cells = sorted(m["cells"], key=lambda cell: float(cell["stiffness"]))
-        x = np.array([cell["stiffness"] for cell in cells], dtype=float)
-        answer[m["title"]] = (x, np.array([cell[key] for cell in cells], dtype=float).T)
-    return answer
-
-
-def stiffness_table() -> str:
-    """Markdown: strict touch, return and penetration at every stiffness of the contact."""
-    columns = ["method", "steps trained", "time constant (ms)", "stiffness, relative"]
-    columns += ["touch at the end [95 %]", "return [range of seeds]", "deepest penetration (mm)"]
-    rows = [
-        [
-            m["title"],
-            f"{m['step']:,}",
-            f"{cell['time_constant_ms']:g}",
-            f"{cell['stiffness']:.3g}",
-            with_interval(cell, "success"),
-            span(cell["return"], ".0f"),
-            f"{max(cell['penetration_mm']):.3f}",
-        ]
-        for m in stiffness().values()
-        for cell in m["cells"]
-    ]
-    return table(columns, rows) if rows else "No stiffness sweep is shipped."

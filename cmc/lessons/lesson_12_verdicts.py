@@ -20,7 +20,6 @@ from cmc.lessons.lesson_12_results import (
     mean_interval,
     methods,
     passing,
-    stiffness,
     table,
     thousands,
 )
@@ -73,7 +72,8 @@ def word(low: float, high: float) -> str:
     return "helps" if low > 0 else "hurts" if high < 0 else "not shown"
 
 
-def _gap(found: tuple[float, float, float], scale: float = 1.0, form: str = "+.0f") -> str:
+def gap_text(found: tuple[float, float, float], scale: float = 1.0, form: str = "+.0f") -> str:
+    """A difference and its interval."""
     if not np.isfinite(found[1]):
         return f"{scale * found[0]:{form}} [one seed: no interval]"
     return f"{scale * found[0]:{form}} [{scale * found[1]:{form}}, {scale * found[2]:{form}}]"
@@ -96,7 +96,7 @@ def parts_table() -> str:
         cells = []
         for key, scale in (("success", 100.0), ("touched", 100.0), ("return", 1.0)):
             gap = difference(*(test[key] for test in tests))
-            cells.append(f"{_gap(gap, scale)}: **{word(*gap[1:])}**")
+            cells.append(f"{gap_text(gap, scale)}: **{word(*gap[1:])}**")
         rows.append([part.bought, names, thousands(tests[0]["step"]), *cells])
     return table(columns, rows)
 
@@ -210,7 +210,7 @@ def claim_only(arm: str) -> tuple[str, str]:
         gap = difference(tests[0]["return"], tests[1]["return"])
         words.append(word(*gap[1:]))
         step = thousands(tests[0]["step"])
-        cells.append(f"over {methods()[name]['title']} at {step}: {_gap(gap)}")
+        cells.append(f"over {methods()[name]['title']} at {step}: {gap_text(gap)}")
     if not words:
         return "no common step", "not tested"
     verdict = "open"
@@ -253,7 +253,7 @@ def claim_passing() -> tuple[str, str]:
     verdict = {"helps": "holds", "hurts": "does not hold", "not shown": "open"}[word(*gap[1:])]
     if not shares["td3"].any():
         verdict = "does not hold: it never does"
-    return f"{text}; difference {_gap(gap, 100.0)} points", verdict
+    return f"{text}; difference {gap_text(gap, 100.0)} points", verdict
 
 
 def claims_table() -> str:
@@ -316,24 +316,3 @@ def aim_verdict(name: str = "ctd3") -> str:
         f"{with_interval(test, 'touched')}). No penetration above {DEEPEST} mm: "
         f"**{'met' if shallow else 'not met'}** (deepest {max(test['penetration_mm']):.3f} mm)."
     )
-
-
-def stiffness_verdict() -> str:
-    """Markdown: what stiffer contact does to policies trained at the nominal one."""
-    lines = []
-    for m in stiffness().values():
-        cells = sorted(m["cells"], key=lambda cell: float(cell["stiffness"]))
-        nominal = min(cells, key=lambda cell: abs(float(cell["stiffness"]) - 1.0))
-        for cell in (cells[-1], cells[0]):
-            if cell is nominal:
-                continue
-            gap = mean_interval(np.subtract(cell["success"], nominal["success"]))
-            what = {"helps": "more touches", "hurts": "fewer touches"}.get(
-                word(*gap[1:]), "no difference shown"
-            )
-            lines.append(
-                f"- {m['title']}, contact {cell['stiffness']:.3g} times as stiff: **{what}**, "
-                f"{_gap(gap, 100.0)} points seed by seed; deepest penetration "
-                f"{max(cell['penetration_mm']):.3f} against {max(nominal['penetration_mm']):.3f} mm"
-            )
-    return "\n".join(lines) if lines else "No stiffness sweep is shipped."

@@ -127,7 +127,7 @@ def _layers(x: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> l
 
 
 def _product(x: Tensor, y: Tensor, shift: Tensor | None = None) -> Tensor:
-    """x y + shift; with a narrow y by its transpose, several times faster in batched products."""
+    """Product of x and y, plus the shift; a narrow y costs several times less by transposes."""
     if y.shape[-1] < NARROW:
         x, y = y.transpose(1, 2), x.transpose(1, 2)
         shift = None if shift is None else shift.transpose(1, 2)
