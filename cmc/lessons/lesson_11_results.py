@@ -34,11 +34,7 @@ RULES = {"at_50_hz": "at 50 Hz", "largest": "largest of each tick"}
 @cache
 def methods(regime: str = "soft") -> dict[str, Method]:
     """Answers of every method by name; none if the regime's file is not shipped."""
-    try:
-        path = store.asset("results", f"{FILES[regime]}.json")
-    except FileNotFoundError:
-        return {}
-    found: dict[str, Method] = store.read_json(path)["methods"]
+    found: dict[str, Method] = store.result(FILES[regime]).get("methods", {})
     return found
 
 

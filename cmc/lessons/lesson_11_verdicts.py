@@ -217,9 +217,8 @@ def paper_sizes() -> dict[str, Any]:
     Returns:
         `text` (Markdown), `step` (points,) and `distance` (seeds, points), mm.
     """
-    try:
-        found = store.read_json(store.asset("results", "peg_maze_paper_sizes.json"))
-    except FileNotFoundError:
+    found = store.result("peg_maze_paper_sizes")
+    if not found:
         return {}
     ours, words = found["ours"], []
     for name, part in (("the paper's", found), ("ours", ours)):

@@ -25,22 +25,15 @@ Run = dict[str, Any]
 @cache
 def stiffness() -> dict[str, Method]:
     """Tests of every method under other contact stiffness; none if no result is shipped."""
-    try:
-        path = store.asset("results", "peg_push_stiffness.json")
-    except FileNotFoundError:
-        return {}
-    found: dict[str, Method] = store.read_json(path)["methods"]
+    found: dict[str, Method] = store.result("peg_push_stiffness").get("methods", {})
     return found
 
 
 @cache
 def trained() -> tuple[Run, ...]:
     """Trainings under other contact, softest first; none if no result is shipped."""
-    try:
-        path = store.asset("results", "peg_push_contact_training.json")
-    except FileNotFoundError:
-        return ()
-    return tuple(sorted(store.read_json(path)["runs"], key=lambda run: float(run["stiffness"])))
+    runs = store.result("peg_push_contact_training").get("runs", [])
+    return tuple(sorted(runs, key=lambda run: float(run["stiffness"])))
 
 
 def stiffness_curves(key: str = "success") -> dict[str, tuple[Array, Array]]:

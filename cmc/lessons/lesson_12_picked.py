@@ -18,11 +18,7 @@ NOTHING = "No picked policies are shipped."
 @cache
 def picked() -> dict[str, dict[str, Any]]:
     """Answers of `cmc.studies.selection` by method; none if no result is shipped."""
-    try:
-        path = store.asset("results", "peg_push_selected.json")
-    except FileNotFoundError:
-        return {}
-    found: dict[str, dict[str, Any]] = store.read_json(path)["methods"]
+    found: dict[str, dict[str, Any]] = store.result("peg_push_selected").get("methods", {})
     return found
 
 

@@ -30,11 +30,7 @@ NEAR, FAR = 1.0, 2.0
 @cache
 def methods() -> dict[str, Method]:
     """Answers of every method by name; none if no result is shipped."""
-    try:
-        path = store.asset("results", "peg_push.json")
-    except FileNotFoundError:
-        return {}
-    found: dict[str, Method] = store.read_json(path)["methods"]
+    found: dict[str, Method] = store.result("peg_push").get("methods", {})
     return found
 
 
