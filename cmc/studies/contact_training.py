@@ -88,15 +88,16 @@ def learn(
 
 
 def _bar(what: str) -> Callback:
-    """A progress bar for one training."""
-    bar = tqdm(desc=what, unit="step", dynamic_ncols=True)
+    """A progress bar for one training, shown once there is something to do."""
+    bars: list[Any] = []
 
     def show(row: dict[str, Any]) -> None:
-        bar.total = row["total_steps"]
-        bar.set_postfix_str(f"reward {row['reward'].mean():.4f}", refresh=False)
-        bar.update(row["steps"] - bar.n)
+        if not bars:
+            bars.append(tqdm(desc=what, unit="step", total=row["total_steps"], dynamic_ncols=True))
+        bars[0].set_postfix_str(f"reward {row['reward'].mean():.4f}", refresh=False)
+        bars[0].update(row["steps"] - bars[0].n)
         if row["steps"] >= row["total_steps"]:
-            bar.close()
+            bars[0].close()
 
     return show
 
