@@ -1,4 +1,4 @@
-"""Lesson 12: policies picked for each seed on validation episodes, judged on fresh ones."""
+"""Lesson 12: the course's aim, for last policies and for those picked on validation episodes."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 from cmc import store
 from cmc.lessons.lesson_11_results import with_interval
 from cmc.lessons.lesson_12_results import methods, table
-from cmc.lessons.lesson_12_verdicts import DEEPEST, TOUCH, TOUCH_SEEDS
 
+TOUCH, TOUCH_SEEDS, DEEPEST = 0.9, 4, 0.2
+"""Our own aim: strict touch in this share of episodes, in so many of 5 seeds; penetration, mm."""
 NOTHING = "No picked policies are shipped."
 
 
@@ -57,3 +58,23 @@ def picked_verdict() -> str:
             f"({TOUCH_SEEDS} wanted), deepest penetration {deepest:.3f} mm ({DEEPEST} allowed)."
         )
     return "\n".join(lines) if lines else NOTHING
+
+
+def aim_verdict(name: str = "ctd3") -> str:
+    """Markdown: whether a method meets the course's own aim for this task."""
+    if name not in methods():
+        return f"No result of `{name}` is shipped."
+    m = methods()[name]
+    test = m["final"]
+    good = int(np.sum(np.asarray(test["success"]) >= TOUCH))
+    shallow = max(test["penetration_mm"]) <= DEEPEST
+    any_time = int(np.sum(np.asarray(test["touched"]) >= TOUCH))
+    return (
+        f"Our own aim was a strict touch in at least {TOUCH:.0%} of the episodes in {TOUCH_SEEDS} "
+        f"seeds. {m['title']} after {test['step']:,} steps: "
+        f"**{'met' if good >= TOUCH_SEEDS else 'not met'}** at the end of the episode ({good} of "
+        f"{len(m['seeds'])} seeds, all episodes {with_interval(test, 'success')}), "
+        f"{'met' if any_time >= TOUCH_SEEDS else 'not met'} at any time ({any_time} seeds, "
+        f"{with_interval(test, 'touched')}). No penetration above {DEEPEST} mm: "
+        f"**{'met' if shallow else 'not met'}** (deepest {max(test['penetration_mm']):.3f} mm)."
+    )

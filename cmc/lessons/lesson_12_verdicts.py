@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cmc.lessons.lesson_11_results import percent, with_interval
+from cmc.lessons.lesson_11_results import percent
 from cmc.lessons.lesson_12_results import (
     FAR,
     NEAR,
@@ -32,8 +32,6 @@ OURS = ("ctd3_paper", "ctd3")
 """Arms that are TD3/C-TD3: the paper's scheme, and the one of this course."""
 THEIRS = ("td3", "control", "ppo_control")
 """Arms that the paper compares with; all others are ours."""
-TOUCH, TOUCH_SEEDS, DEEPEST = 0.9, 4, 0.2
-"""Our own aim: strict touch in this share of episodes, in so many of 5 seeds; penetration, mm."""
 
 
 class Part(NamedTuple):
@@ -296,23 +294,3 @@ def claims_table() -> str:
     ]
     columns = ["the paper says (12M steps)", "rule", "found", "verdict"]
     return table(columns, [[says, rule, text, f"**{end}**"] for says, rule, (text, end) in rows])
-
-
-def aim_verdict(name: str = "ctd3") -> str:
-    """Markdown: whether a method meets the course's own aim for this task."""
-    if name not in methods():
-        return f"No result of `{name}` is shipped."
-    m = methods()[name]
-    test = m["final"]
-    good = int(np.sum(np.asarray(test["success"]) >= TOUCH))
-    shallow = max(test["penetration_mm"]) <= DEEPEST
-    any_time = int(np.sum(np.asarray(test["touched"]) >= TOUCH))
-    return (
-        f"Our own aim was a strict touch in at least {TOUCH:.0%} of the episodes in {TOUCH_SEEDS} "
-        f"seeds. {m['title']} after {test['step']:,} steps: "
-        f"**{'met' if good >= TOUCH_SEEDS else 'not met'}** at the end of the episode ({good} of "
-        f"{len(m['seeds'])} seeds, all episodes {with_interval(test, 'success')}), "
-        f"{'met' if any_time >= TOUCH_SEEDS else 'not met'} at any time ({any_time} seeds, "
-        f"{with_interval(test, 'touched')}). No penetration above {DEEPEST} mm: "
-        f"**{'met' if shallow else 'not met'}** (deepest {max(test['penetration_mm']):.3f} mm)."
-    )
