@@ -12,16 +12,23 @@ from cmc.studies.selection import load_picked, main, pick
 from cmc.studies.two_level_training import load
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs")
+def trained(name, folder):
+    """Two kept policies that differ, in all that learns."""
     for steps in (160, 320):
-        path = peg_push.train("ctd3", [0, 1, 2], steps=steps, out=folder)
+        path = peg_push.train(name, [0, 1, 2], steps=steps, out=folder)
     tensors, record = store.load_checkpoint(path)
-    rng = np.random.default_rng(0)  # two kept policies that differ
-    mixed = {k: v + 0.1 * rng.random(v.shape).astype(v.dtype) for k, v in tensors.items()}
+    rng = np.random.default_rng(0)
+    mixed = {
+        k: v if name == "gain" and ".low." in k else v + 0.1 * rng.random(v.shape).astype(v.dtype)
+        for k, v in tensors.items()
+    }
     store.save_checkpoint(path, mixed, record)
     return path
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return trained("ctd3", tmp_path_factory.mktemp("runs"))
 
 
 def test_the_best_share_is_picked_and_the_later_one_of_equals():
@@ -35,24 +42,26 @@ def test_the_best_share_is_picked_and_the_later_one_of_equals():
         pick([])
 
 
-def test_every_seed_acts_as_the_policy_picked_for_it(run):
+@pytest.mark.parametrize("name", ["ctd3", "gain"])
+def test_every_seed_acts_as_the_policy_picked_for_it(run, name, tmp_path):
+    run = run if name == "ctd3" else trained(name, tmp_path)
     steps = [320, 160, 320]
-    planner, low, _ = load_picked(peg_push.STUDY, "ctd3", steps, run)
+    planner, low, _ = load_picked(peg_push.STUDY, name, steps, run)
     inputs = next(planner.parameters()).shape[-2:]
     rng = np.random.default_rng(1)
     size = peg_push.STUDY.planning().observe(task := _task(), task.reset()).shape[-1]
     assert size in inputs
     seen, signals = rng.normal(size=(3, 4, size)), rng.normal(size=(3, 4, 25))
     for seed, step in enumerate(steps):
-        own, own_low, _ = load(peg_push.STUDY, "ctd3", step, run)
+        own, own_low, _ = load(peg_push.STUDY, name, step, run)
         np.testing.assert_array_equal(evaluate(planner, seen)[seed], evaluate(own, seen)[seed])
         np.testing.assert_array_equal(
             low.act(signals, explore=False)[seed], own_low.act(signals, explore=False)[seed]
         )
-    other, _, _ = load(peg_push.STUDY, "ctd3", 160, run)
+    other, _, _ = load(peg_push.STUDY, name, 160, run)
     assert not np.allclose(evaluate(planner, seen)[0], evaluate(other, seen)[0])
     with pytest.raises(ValueError, match="each of 3 seeds, got 2"):
-        load_picked(peg_push.STUDY, "ctd3", [160, 320], run)
+        load_picked(peg_push.STUDY, name, [160, 320], run)
 
 
 def _task():

@@ -66,10 +66,13 @@ def load_picked(
 
 
 def _copy_seeds(to: nn.Module, source: nn.Module, mask: torch.Tensor) -> None:
-    """Copy the masked seeds' weights; every parameter's first axis holds the seeds, one by one."""
+    """Copy the masked seeds' weights; the first axis of what learned holds the seeds, in order."""
     new = source.state_dict()
     mixed = {}
     for key, value in to.state_dict().items():
+        if torch.equal(value, new[key]):  # did not learn, and may be one for all seeds
+            mixed[key] = value
+            continue
         parts = value.reshape(len(mask), -1).clone()
         parts[mask] = new[key].reshape(len(mask), -1)[mask]
         mixed[key] = parts.reshape(value.shape)
