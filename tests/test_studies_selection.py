@@ -15,7 +15,7 @@ from cmc.studies.two_level_training import load
 def trained(name, folder):
     """Two kept policies that differ, in all that learns."""
     for steps in (160, 320):
-        path = peg_push.train(name, [0, 1, 2], steps=steps, out=folder)
+        path = peg_push.train(name, range(4), steps=steps, out=folder)
     tensors, record = store.load_checkpoint(path)
     rng = np.random.default_rng(0)
     mixed = {
@@ -45,13 +45,13 @@ def test_the_best_share_is_picked_and_the_later_one_of_equals():
 @pytest.mark.parametrize("name", ["ctd3", "gain"])
 def test_every_seed_acts_as_the_policy_picked_for_it(run, name, tmp_path):
     run = run if name == "ctd3" else trained(name, tmp_path)
-    steps = [320, 160, 320]
+    steps = [320, 160, 320, 320]
     planner, low, _ = load_picked(peg_push.STUDY, name, steps, run)
     inputs = next(planner.parameters()).shape[-2:]
     rng = np.random.default_rng(1)
     size = peg_push.STUDY.planning().observe(task := _task(), task.reset()).shape[-1]
     assert size in inputs
-    seen, signals = rng.normal(size=(3, 4, size)), rng.normal(size=(3, 4, 25))
+    seen, signals = rng.normal(size=(4, 2, size)), rng.normal(size=(4, 2, 25))
     for seed, step in enumerate(steps):
         own, own_low, _ = load(peg_push.STUDY, name, step, run)
         np.testing.assert_array_equal(evaluate(planner, seen)[seed], evaluate(own, seen)[seed])
@@ -60,7 +60,7 @@ def test_every_seed_acts_as_the_policy_picked_for_it(run, name, tmp_path):
         )
     other, _, _ = load(peg_push.STUDY, name, 160, run)
     assert not np.allclose(evaluate(planner, seen)[0], evaluate(other, seen)[0])
-    with pytest.raises(ValueError, match="each of 3 seeds, got 2"):
+    with pytest.raises(ValueError, match="each of 4 seeds, got 2"):
         load_picked(peg_push.STUDY, name, [160, 320], run)
 
 
@@ -70,8 +70,8 @@ def _task():
 
 def test_the_command_judges_on_fresh_episodes(run, tmp_path, capsys):
     tests = [
-        {"step": 160, "touched": [0.0, 0.5, 0.1]},
-        {"step": 320, "touched": [0.1, 0.2, 0.3]},
+        {"step": 160, "touched": [0.0, 0.5, 0.1, 0.0]},
+        {"step": 320, "touched": [0.1, 0.2, 0.3, 0.4]},
     ]
     results = store.write_json(
         tmp_path / "results.json", {"methods": {"ctd3": {"title": "ours", "tests": tests}}}
@@ -79,9 +79,9 @@ def test_the_command_judges_on_fresh_episodes(run, tmp_path, capsys):
     out = tmp_path / "selected.json"
     request = ["--results", str(results), "--checkpoints", str(run.parent), "--episodes", "1"]
     main([*request, "--write", str(out)])
-    assert "steps [320, 160, 320]" in capsys.readouterr().out
+    assert "steps [320, 160, 320, 320]" in capsys.readouterr().out
     found = store.read_json(out)["methods"]["ctd3"]
-    assert found["picked"] == [320, 160, 320]
+    assert found["picked"] == [320, 160, 320, 320]
     assert found["episodes"] == 1
     assert all(0 <= share <= 1 for share in found["touched"])
     with pytest.raises(ValueError, match="unknown methods"):
