@@ -76,15 +76,18 @@ def stiffness_verdict() -> str:
             if cell is nominal:
                 continue
             gap = mean_interval(np.subtract(cell["success"], nominal["success"]))
-            what = {"helps": "more touches", "hurts": "fewer touches"}.get(
-                word(*gap[1:]), "no difference shown"
-            )
+            what = _said(gap, "more touches", "fewer touches")
             lines.append(
                 f"- {m['title']}, contact {cell['stiffness']:.3g} times as stiff: **{what}**, "
                 f"{gap_text(gap, 100.0)} points seed by seed; deepest penetration "
                 f"{max(cell['penetration_mm']):.3f} against {max(nominal['penetration_mm']):.3f} mm"
             )
     return "\n".join(lines) if lines else NO_SWEEP
+
+
+def _said(gap: tuple[float, float, float], more: str, less: str) -> str:
+    """A difference in words, by its interval."""
+    return {"helps": more, "hurts": less}.get(word(*gap[1:]), "no difference shown")
 
 
 # -- trained under other contact -------------------------------------------------------------------
@@ -148,9 +151,7 @@ def trained_verdict() -> str:
     for run, own, usual in pairs():
         shares = [np.mean([t["touched"] for t in tests], axis=0) for tests in (own, usual)]
         gap = difference(*shares)
-        what = {"helps": "easier to learn", "hurts": "harder to learn"}.get(
-            word(*gap[1:]), "no difference shown"
-        )
+        what = _said(gap, "easier to learn", "harder to learn")
         lines.append(
             f"- {run['title']}, contact {run['stiffness']:.3g} times as stiff: **{what}**, "
             f"{gap_text(gap, 100.0)} points of touches at any time, over {len(own)} kept policies "

@@ -49,6 +49,7 @@ def learn(
     out: str | Path = "runs/peg_push_contact",
     study: TwoLevelStudy = peg_push.STUDY,
     callback: Callable[[str], Callback] | None = None,
+    testing: Callable[[int, str], object] | None = None,
 ) -> dict[str, Any]:
     """Train and test methods at every scale; finished parts are not repeated.
 
@@ -61,6 +62,7 @@ def learn(
         out: folder of the runs.
         study: peg push, perhaps in a smaller configuration.
         callback: told "METHOD, scale S" it gives what `train` calls after every segment.
+        testing: called before each test with its number and what it is.
 
     Returns:
         `runs`, one for each method and scale: `method`, `scale`, `stiffness` relative to the
@@ -79,7 +81,7 @@ def learn(
         report = callback(f"{name}, scale {scale:g}") if callback is not None else None
         folder = Path(out) / f"{scale:g}"
         path = train(here, name, seeds, steps=steps, out=folder, callback=report)
-        tests = evaluate_method(here, name, path, count, folder / f"{name}.json")
+        tests = evaluate_method(here, name, path, count, folder / f"{name}.json", testing)
         runs.append({"method": name, "scale": scale, "stiffness": round(scale**-2, 6), **tests})
     command = f"python -m cmc.studies.contact_training --method {' '.join(names)}"
     command += f" --scale {' '.join(f'{scale:g}' for scale in scales)}"
@@ -121,6 +123,7 @@ def main(words: Sequence[str] | None = None) -> None:
         steps=chosen.steps,
         out=chosen.out,
         callback=_bar,
+        testing=lambda number, what: print(f"test {number + 1}: {what}", flush=True),
     )
     for run in answer["runs"]:
         print(f"scale {run['scale']:g}: {verdict(run)}")

@@ -9,13 +9,14 @@ other test uses. `python -m cmc.studies.selection` writes `assets/results/peg_pu
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import nn
+from tqdm import tqdm
 
 from cmc import store
 from cmc.learning.low_level import LowLevel
@@ -80,22 +81,29 @@ def _copy_seeds(to: nn.Module, source: nn.Module, mask: torch.Tensor) -> None:
 
 
 def select(
-    methods: dict[str, Any], episodes: int = 100, checkpoints: str | Path | None = None
+    methods: dict[str, Any],
+    episodes: int = 100,
+    checkpoints: str | Path | None = None,
+    progress: Callable[[str, dict[str, Any] | None], object] | None = None,
 ) -> dict[str, Any]:
     """Pick and test policies of peg push.
 
     Args:
         methods: of a result file of `evaluate`; those without several kept policies are left out.
         episodes: fresh test episodes of each seed.
-        checkpoints: folder of checkpoint files; the shipped ones if None.
+        checkpoints: folder of checkpoint files; the shipped ones if None. Those hold all kept
+            policies of the study's first method only.
+        progress: called with each method and its answer, None before it is tested.
 
     Returns:
-        By method `title`, `picked` (steps, one for each seed) and what `summary` holds.
+        By method `title`, `seeds`, `picked` (steps, one for each seed) and what `summary` holds.
     """
     if episodes < 1:
         raise ValueError(f"episodes: wanted at least 1, got {episodes}")
-    answer = {}
+    report = progress or (lambda name, found: None)
+    answer: dict[str, Any] = {}
     for name, method in methods.items():
+        report(name, None)
         if len(method["tests"]) < 2:
             continue
         picked = pick(method["tests"])
@@ -103,7 +111,9 @@ def select(
         planner, low, record = load_picked(STUDY, name, picked, path)
         with single_thread():
             found = run_episodes(STUDY, planner, low, len(record["seeds"]), episodes, FRESH)
-        answer[name] = {"title": method["title"], "picked": picked, **summary(found)}
+        named = {"title": method["title"], "seeds": record["seeds"], "picked": picked}
+        answer[name] = named | summary(found)
+        report(name, answer[name])
     return answer
 
 
@@ -121,12 +131,20 @@ def main(arguments: Iterable[str] | None = None) -> None:
     unknown = sorted(set(names) - set(methods))
     if unknown:
         raise ValueError(f"unknown methods {unknown}; wanted some of {', '.join(methods)}")
-    found = select({name: methods[name] for name in names}, chosen.episodes, chosen.checkpoints)
-    for method in found.values():
-        shares = ", ".join(f"{100 * share:.0f}" for share in method["touched"])
-        print(f"{method['title']}: steps {method['picked']}, strict touch in {shares} %")
+    wanted = {name: methods[name] for name in names}
+    with tqdm(total=len(names), unit="method", dynamic_ncols=True) as bar:
+
+        def show(name: str, method: dict[str, Any] | None) -> None:
+            bar.set_postfix_str(name)
+            if method is not None:
+                shares = ", ".join(f"{100 * share:.0f}" for share in method["touched"])
+                steps = method["picked"]
+                bar.write(f"{method['title']}: steps {steps}, strict touch in {shares} %")
+                bar.update()
+
+        found = select(wanted, chosen.episodes, chosen.checkpoints, show)
     command = f"python -m cmc.studies.selection --method {' '.join(found)}"
-    made = store.provenance(command, [*range(5)])
+    made = store.provenance(command, max((m["seeds"] for m in found.values()), key=len, default=[]))
     content = {"study": STUDY.name, "episodes": chosen.episodes, "methods": found, **made}
     store.write_json(chosen.write or Path("assets/results/peg_push_selected.json"), content)
 

@@ -1,0 +1,104 @@
+"""Exact certificates: transforms that turn, nonlinear plants, and what is refused."""
+
+import numpy as np
+import pytest
+from test_theory_certify import policy
+
+from cmc import plants
+from cmc.theory.auxiliary import AuxiliarySpace, decompose
+from cmc.theory.certify import certify
+from cmc.theory.contraction import rate_from_cloud
+from cmc.theory.exact import Region, closed_loop, total_jacobian
+from cmc.theory.simulate import rk4
+
+
+class Turning:
+    """T_a = Rot(3 y1) on two plain lags: what the frozen view takes for a constant."""
+
+    u0 = 0.0
+
+    def slope_bounds(self):
+        bounds = np.tile([0.5, 0.1], (2, 1))
+        return bounds, bounds
+
+    def pi(self, s):
+        return 0.5 * s[..., 0] + 0.1 * s[..., 1] - np.array([0.0, -5.0])
+
+    @staticmethod
+    def spaces(y):
+        angle = 3 * y[..., 0]
+        rot = np.stack(
+            [
+                np.stack([np.cos(angle), -np.sin(angle)], -1),
+                np.stack([np.sin(angle), np.cos(angle)], -1),
+            ],
+            -2,
+        )
+        eye = np.broadcast_to(np.eye(2), rot.shape)
+        return AuxiliarySpace(eye, rot, -eye, rot)
+
+
+def test_frozen_passes_and_exact_fails_where_the_transform_turns():
+    plant = plants.Lags(tau=(1.0, 1.0), gain=(1.0, 1.0))
+    region = Region([-0.35, -0.5], [0.35, 0.5])
+    turning = Turning()
+    frozen = certify(turning, plant, region=region, kind="frozen", transforms=Turning.spaces)
+    assert frozen
+    assert "frozen" in str(frozen)
+    exact = certify(turning, plant, region=region, kind="exact", transforms=Turning.spaces)
+    assert not exact
+    assert not exact.refused
+    # by hand, with the slopes at zero: -1 + 15 cos(0.9) = 8.32 at y1 = 0.3
+    field = closed_loop(turning, plant, Turning.spaces)
+    hand = total_jacobian(lambda s: field(s) + _without_feedback(s), np.array([0.3, 0, 0, 0.0]))
+    assert np.linalg.eigvals(hand).real.max() == pytest.approx(8.32, abs=0.01)
+
+
+def _without_feedback(s):
+    y, I = s[..., :2], s[..., 2:]
+    a = (0.5 * y + 0.1 * I)[..., None]
+    push = (Turning.spaces(y).T_a @ a)[..., 0]
+    return np.concatenate([push, np.zeros_like(push)], axis=-1)
+
+
+def test_exact_certificate_of_a_nonlinear_plant_is_obeyed():
+    plant = plants.get("pendulum")
+    region = Region([-0.3, -0.3], [0.3, 0.3], integral=0.3, points=5)
+    pol = policy((0.8, 0.3), (0.2, 0.1))
+    answer = certify(pol, plant, region=region, kind="exact")
+    assert answer, str(answer)
+    assert answer.kind == "exact"
+    assert "in it" in answer.reason
+
+    def spaces(y):
+        u = plant.hold(y)
+        return decompose(plant.f_y(y, u), plant.f_u(y, u))
+
+    field = closed_loop(pol, plant, spaces)
+    times, rng = np.linspace(0, 4, 200), np.random.default_rng(8)
+    paths = rk4(lambda t, s: field(s), rng.uniform(-0.05, 0.05, (8, 4)), times)
+    assert np.abs(paths).max() < 0.3
+    measured = rate_from_cloud(times, paths, answer.metric)
+    assert (measured.ratio <= np.exp(-answer.rate * times) * (1 + 1e-6)).all()
+    sampled = certify(pol, plant, region=region, kind="exact", h=0.02)
+    assert sampled
+    assert (sampled.kind, sampled.domain) == ("exact", "sampled")
+
+
+def test_exact_is_refused_where_it_cannot_be_had():
+    class BoundsOnly:
+        def slope_bounds(self):
+            return np.full((2, 2), 0.2), np.full((2, 2), 0.5)
+
+    blind = certify(BoundsOnly(), plants.get("pendulum"), kind="exact")
+    assert blind.refused
+    assert "neither pi(s) nor a network" in blind.reason
+
+    def flipping(y):
+        space = AuxiliarySpace.identity(np.diag([-1.0, -2.0]), np.eye(2))
+        sign = np.where(y[..., :1, None] > 0.1, -1.0, 1.0)
+        eye = np.broadcast_to(np.eye(2), (*y.shape[:-1], 2, 2))
+        return AuxiliarySpace(eye * sign, eye, eye * 0 + space.Lambda, eye)
+
+    lags = plants.get("lags")
+    assert "track" in certify(policy(), lags, kind="exact", transforms=flipping).reason
