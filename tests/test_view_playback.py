@@ -1,21 +1,13 @@
 """Playback without a browser: what is recorded, how it is packed, what the live view leaves."""
 
-import asyncio
 import base64
 import json
 import re
-import socket
-import threading
-import time
-import urllib.error
-import urllib.request
 
 import mujoco
 import numpy as np
 import pytest
 import umsgpack
-from tornado.httpclient import HTTPClientError, HTTPRequest
-from tornado.websocket import websocket_connect
 
 from cmc.view.playback import Arrow, Camera, Marker, around, notebook, record
 from cmc.view.playback.cameras import FIELD_OF_VIEW
@@ -349,83 +341,6 @@ def test_own_cameras_replace_the_presets(model):
     qpos, _, times = tumble(model, frames=2)
     mine = {"mine": Camera((1, 0, 0), (0, 0, 0))}
     assert record(model, qpos, times, cameras=mine).cameras == mine
-
-
-# ---- live view -------------------------------------------------------------------------------
-
-
-def refused(port, host="127.0.0.1"):
-    with socket.socket() as probe:
-        probe.settimeout(1.0)
-        return probe.connect_ex((host, port)) != 0
-
-
-async def follow(url, count, act):
-    """Connect as a browser does, read the scene, act, read `count` more messages."""
-    client = await websocket_connect(url.replace("http", "ws") + "socket")
-    received = []
-    while not received or received[-1]["path"] != "/meshcat/last":
-        received.append(umsgpack.unpackb(await asyncio.wait_for(client.read_message(), 5)))
-    act()
-    fresh = [
-        umsgpack.unpackb(await asyncio.wait_for(client.read_message(), 5)) for _ in range(count)
-    ]
-    client.close()
-    return received, fresh
-
-
-def test_live_view_serves_drives_and_leaves_nothing(model):
-    qpos, _, times = tumble(model, frames=1)
-    before = set(threading.enumerate())
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos[0]
-    data.qpos[0] = 0.25
-    mujoco.mj_kinematics(model, data)
-    with record(model, qpos, times).serve(timeout=30) as live:
-        with urllib.request.urlopen(live.url, timeout=5) as answer:
-            assert b"cmcPlayback" in answer.read()
-        live.visualizer["last"].set_property("visible", True)  # marks the end of the scene
-        scene, fresh = asyncio.run(follow(live.url, 4, lambda: live.update(data)))
-        assert {c["type"] for c in scene} == {"set_object", "set_transform", "set_property"}
-        moved = {c["path"]: np.reshape(c["matrix"], (4, 4)).T for c in fresh}
-        np.testing.assert_allclose(moved["/meshcat/torso"][:3, 3], data.body("torso").xpos)
-        assert refused(live.port, "127.0.0.2")  # a server on all interfaces would answer here
-    live.close()
-    assert live.closed
-    assert set(threading.enumerate()) <= before
-    assert refused(live.port)
-    with pytest.raises(RuntimeError, match="closed"):
-        live.update(data)
-
-
-def test_live_view_closes_itself(model):
-    qpos, _, times = tumble(model, frames=1)
-    live = record(model, qpos, times).serve(timeout=0.1)
-    deadline = time.monotonic() + 5
-    while not live.closed and time.monotonic() < deadline:
-        time.sleep(0.02)
-    assert live.closed
-    assert refused(live.port)
-    live.close()
-    with pytest.raises(ValueError, match="timeout"):
-        record(model, qpos, times).serve(timeout=0)
-
-
-def test_live_view_answers_no_foreign_host_or_origin(model):
-    qpos, _, times = tumble(model, frames=1)
-    with record(model, qpos, times).serve(timeout=30) as live:
-        request = urllib.request.Request(live.url, headers={"Host": "evil.example"})
-        with pytest.raises(urllib.error.HTTPError, match="403"):
-            urllib.request.urlopen(request, timeout=5)
-        foreign = HTTPRequest(
-            live.url.replace("http", "ws") + "socket", headers={"Origin": "http://evil.example"}
-        )
-
-        async def knock():
-            await websocket_connect(foreign)
-
-        with pytest.raises(HTTPClientError, match="403"):
-            asyncio.run(knock())
 
 
 def test_markers_without_a_color_get_different_ones():
