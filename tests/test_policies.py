@@ -14,7 +14,6 @@ from cmc.policies import (
     ModularPolicy,
     NegativeWeightError,
     PositiveNetwork,
-    StackedMLP,
     as_numpy,
     tanh,
 )
@@ -74,28 +73,6 @@ def test_positive_jacobian_equals_autograd(hidden, bias):
         torch.testing.assert_close(torch.einsum("biij->bij", full), slope)
         assert full[:, 0, 1].abs().max() == 0  # one network per dimension: no cross slopes
         assert full[:, 1, 0].abs().max() == 0
-
-
-@pytest.mark.parametrize("bias", [True, False])
-def test_gradients_of_the_stacked_network_to_second_order(bias):
-    network = StackedMLP(2, 3, (5, 4), copies=2, seeds=[0, 1], bias=bias, dtype=f64)
-    shake(network, 0.3)
-    x = signals(4, 3, 2).requires_grad_()
-
-    def run(x, *weights):
-        return network.run(x, weights)
-
-    weights = [weight.detach().clone().requires_grad_() for weight in network.weights]
-    assert torch.autograd.gradcheck(run, (x, *weights))
-    assert torch.autograd.gradgradcheck(run, (x, *weights))
-    plain = network.hidden_values(x, list(network.weights))[-1]
-    torch.testing.assert_close(network(x), plain)
-    ours, theirs = (
-        torch.autograd.grad(out.square().sum(), list(network.parameters()))
-        for out in (network(x), plain)
-    )
-    for mine, other in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(mine, other)
 
 
 def test_unconstrained_jacobian_equals_autograd_and_has_both_signs():
