@@ -46,7 +46,7 @@ def _problems(output: Any) -> list[str]:
         return ["a traceback was printed"] if traced else []
     data = output.get("data", {})
     described = str(data.get("text/plain", "")).startswith("Figure: ")
-    return ["a figure without plots.describe"] if "image/png" in data and not described else []
+    return ["a figure without figures.describe"] if "image/png" in data and not described else []
 
 
 def _search_after_execution() -> None:

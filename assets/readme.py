@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from cmc.lessons.lesson_00 import random_networks, target
-from cmc.view import plots
+from cmc.view import figures
 
 
 def main() -> None:
@@ -13,10 +13,10 @@ def main() -> None:
     loops = random_networks(number=60)
     k = loops["example"]
     many = random_networks(number=k + 1, starts=32)
-    fig, axes = plots.panels(1, 2, width=9.6, height=5.0, sharex=True, sharey=True)
+    fig, axes = figures.panels(1, 2, width=9.6, height=5.0, sharex=True, sharey=True)
     kinds = {
-        "any": ("weights of any sign", plots.BAD),
-        "positive": ("positive weights", plots.GOOD),
+        "any": ("weights of any sign", figures.BAD),
+        "positive": ("positive weights", figures.GOOD),
     }
     for ax, (kind, (name, color)) in zip(axes[0], kinds.items(), strict=True):
         apart = int((loops[f"apart_{kind}"] > 0.1).sum())
@@ -30,7 +30,7 @@ def main() -> None:
         title = f"{name}: in {apart} of 60 networks\ntrajectories stay apart"
         ax.text(0.5, 0.99, title, transform=ax.transAxes, ha="center", va="top", fontsize=12)
     text = "One plant, one moving target, two random networks: 32 starts, black dots at the end."
-    print(plots.save(fig, Path(__file__).with_name("readme.png"), text))
+    print(figures.save(fig, Path(__file__).with_name("readme.png"), text))
 
 
 if __name__ == "__main__":

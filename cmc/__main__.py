@@ -198,12 +198,12 @@ def _play(chosen: argparse.Namespace) -> None:
 
 def _picture(motion: dict[str, Any], out: Path) -> Any:
     """Signals over time."""
-    from cmc.view import plots
+    from cmc.view import figures
 
-    fig, axes = plots.panels(1, len(motion["signals"]), width=9)
+    fig, axes = figures.panels(1, len(motion["signals"]), width=9)
     for ax, (label, values, target) in zip(axes.flat, motion["signals"], strict=True):
-        plots.trajectories(motion["t"], values, labels=("time (s)", label), target=target, ax=ax)
-    return plots.save(fig, out, motion["text"])
+        figures.trajectories(motion["t"], values, labels=("time (s)", label), target=target, ax=ax)
+    return figures.save(fig, out, motion["text"])
 
 
 def _page(motion: dict[str, Any], out: Path) -> Path:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, overload
 
 import numpy as np
@@ -24,23 +25,27 @@ Judge = Callable[[Any], None]
 CHECKS: dict[str, Judge] = {}
 """Checks that have been loaded, by name."""
 
-__all__ = ["CHECKS", "Passed", "check", "expect", "expect_close", "names"]
+__all__ = ["CHECKS", "Verdict", "check", "expect", "expect_close", "judge", "names"]
 
 
-class Passed:
-    """What a passed check returns: one line that a notebook shows."""
+@dataclass(frozen=True)
+class Verdict:
+    """What a check answers: true if the exercise is solved, and one calm line to show."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    passed: bool
+    line: str
+
+    def __bool__(self) -> bool:
+        return self.passed
 
     def __repr__(self) -> str:
-        return f"Passed: {self.name}"
+        return self.line
 
 
 @overload
 def check(name: str) -> Callable[[Judge], Judge]: ...
 @overload
-def check(name: str, answer: Any, /) -> Passed: ...
+def check(name: str, answer: Any, /) -> Verdict: ...
 
 
 def check(name: str, *answer: Any) -> Any:
@@ -51,11 +56,10 @@ def check(name: str, *answer: Any) -> Any:
         answer: what the reader wrote: a function, an array or a number.
 
     Returns:
-        `Passed`, or the decorator.
+        A `Verdict`, or the decorator. A wrong or unwritten answer, or one that fails, is a verdict
+        too: a notebook runs on.
 
     Raises:
-        AssertionError: if the answer is wrong, with a sentence that says what was wanted.
-        NotImplementedError: if the answer is a stub that was not written yet.
         KeyError: if there is no such exercise.
         ValueError: if the name does not start with a lesson's number, or is taken.
     """
@@ -63,12 +67,28 @@ def check(name: str, *answer: Any) -> Any:
         raise ValueError(f"wanted a name like '02-sign-rule', got {name!r}")
     if not answer:
         return lambda judge: _register(name, judge)
-    _load(name[:2])
-    if name not in CHECKS:
-        known = ", ".join(n for n in CHECKS if n[:2] == name[:2]) or "none"
-        raise KeyError(f"no exercise {name!r}; lesson {name[:2]} has: {known}")
-    CHECKS[name](*answer)
-    return Passed(name)
+    _find(name)
+    try:
+        judge(name, *answer)
+    except NotImplementedError:
+        return Verdict(False, f"{name}: not written yet.")
+    except AssertionError as error:
+        return Verdict(False, f"{name}: {error}")
+    except Exception as error:
+        kind = type(error).__name__
+        return Verdict(False, f"{name}: your code stopped with {kind}: {error}")
+    return Verdict(True, f"{name}: solved.")
+
+
+def judge(name: str, answer: Any) -> None:
+    """Judge an answer by raising: nothing if it is right.
+
+    Raises:
+        AssertionError: if the answer is wrong, with a sentence that says what was wanted.
+        NotImplementedError: if the answer is a stub that was not written yet.
+        KeyError: if there is no such exercise.
+    """
+    _find(name)(answer)
 
 
 def names(lesson: str) -> list[str]:
@@ -115,6 +135,14 @@ def expect_close(
         where = tuple(int(i) for i in np.argwhere(~near)[0])
         place = f" at {where}" if where else ""
         expect(False, f"{what}{place} should be {right[where]:.6g}, yours is {found[where]:.6g}")
+
+
+def _find(name: str) -> Judge:
+    _load(name[:2])
+    if name not in CHECKS:
+        known = ", ".join(n for n in CHECKS if n[:2] == name[:2]) or "none"
+        raise KeyError(f"no exercise {name!r}; lesson {name[:2]} has: {known}")
+    return CHECKS[name]
 
 
 def _register(name: str, judge: Judge) -> Judge:

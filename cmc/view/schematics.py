@@ -1,6 +1,6 @@
 """The paper's schematic figures, redrawn by code. Nothing here is data.
 
-Each function returns a figure for `cmc.view.plots.describe`. Coordinates are in units of the
+Each function returns a figure for `cmc.view.figures.describe`. Coordinates are in units of the
 figure; every box and arrow is placed by hand.
 """
 

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.image import imread
 from PIL import Image
 
-from cmc.view import plots, schematics, style
+from cmc.view import figures, schematics, style
 
 
 @pytest.fixture(autouse=True)
@@ -24,24 +24,24 @@ def spiral(number=6):
     return t, np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=-1)
 
 
-def figures():
+def drawn():
     t, paths = spiral()
-    points = plots.grid((-2, 2), (-1, 3), 9)
+    points = figures.grid((-2, 2), (-1, 3), 9)
     rng = np.random.default_rng(0)
     return {
-        "phase_portrait": plots.phase_portrait(points, -points, paths, equilibrium=[0, 0]),
-        "phase_portrait without a field": plots.phase_portrait(paths=paths[:, 0]),
-        "trajectories": plots.trajectories(t, paths[..., 0], name="bundle", target=0.0),
-        "distances": plots.distances(t, np.exp(-t), rate=1.0),
-        "convergence": plots.convergence(t, paths, rate=0.5, overshoot=1.5),
-        "eigenvalues": plots.eigenvalues({"$F_{11}$": [-1 + 2j, -1 - 2j]}),
-        "eigenvalues of a sampled loop": plots.eigenvalues([0.5, -0.2j], region="disc"),
-        "matrix": plots.matrix(np.eye(4), block=2, labels=list("abcd"), title="$F$"),
-        "matrices": plots.matrices({"$R$": np.eye(2), "$F$": np.ones((4, 4))}),
-        "curves": plots.curves(t, {"a": t + 1, "b": t**2 + 1}, labels=("t (s)", "y"), log="xy"),
-        "histogram": plots.histogram({"a": rng.normal(size=99)}, label_x="error (N)", log=True),
-        "learning_curves": plots.learning_curves(t, {"TD3": rng.normal(size=(3, 80))}),
-        "region": plots.region(t, t[:5], rng.normal(size=(5, 80)), labels=("a", "b", "c")),
+        "phase_portrait": figures.phase_portrait(points, -points, paths, equilibrium=[0, 0]),
+        "phase_portrait without a field": figures.phase_portrait(paths=paths[:, 0]),
+        "trajectories": figures.trajectories(t, paths[..., 0], name="bundle", target=0.0),
+        "distances": figures.distances(t, np.exp(-t), rate=1.0),
+        "convergence": figures.convergence(t, paths, rate=0.5, overshoot=1.5),
+        "eigenvalues": figures.eigenvalues({"$F_{11}$": [-1 + 2j, -1 - 2j]}),
+        "eigenvalues of a sampled loop": figures.eigenvalues([0.5, -0.2j], region="disc"),
+        "matrix": figures.matrix(np.eye(4), block=2, labels=list("abcd"), title="$F$"),
+        "matrices": figures.matrices({"$R$": np.eye(2), "$F$": np.ones((4, 4))}),
+        "curves": figures.curves(t, {"a": t + 1, "b": t**2 + 1}, labels=("t (s)", "y"), log="xy"),
+        "histogram": figures.histogram({"a": rng.normal(size=99)}, label_x="error (N)", log=True),
+        "learning_curves": figures.learning_curves(t, {"TD3": rng.normal(size=(3, 80))}),
+        "region": figures.region(t, t[:5], rng.normal(size=(5, 80)), labels=("a", "b", "c")),
         "signal_flow": schematics.signal_flow(),
         "two_spaces": schematics.two_spaces(),
         "one_network_per_dimension": schematics.one_network_per_dimension(2),
@@ -53,22 +53,22 @@ def figures():
 
 def test_every_figure_is_drawn_inside_its_frame(tmp_path):
     """Not blank, and nothing of it (labels included) touches the edge of the picture."""
-    for name, figure in figures().items():
-        pixels = imread(plots.save(figure, tmp_path / "figure.png", name))[..., :3]
+    for name, figure in drawn().items():
+        pixels = imread(figures.save(figure, tmp_path / "figure.png", name))[..., :3]
         assert pixels.std() > 0.02, name
         edge = np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])
         assert edge.min() > 0.98, f"{name} is cut off"
 
 
 def test_every_figure_with_data_has_labels_with_units_where_it_has_axes():
-    for name, figure in figures().items():
+    for name, figure in drawn().items():
         for ax in figure.axes:
             if ax.axison and len(ax.get_xticks()) and not name.startswith("matri"):
                 assert ax.get_xlabel() or ax.get_ylabel(), name
 
 
 def test_a_saved_figure_carries_its_description(tmp_path):
-    file = plots.save(plots.trajectories([0, 1], [1, 2]), tmp_path / "a.png", "One line rises.")
+    file = figures.save(figures.trajectories([0, 1], [1, 2]), tmp_path / "a.png", "One line rises.")
     assert Image.open(file).text["Description"] == "One line rises."
     assert plt.get_fignums() == []
 
@@ -77,8 +77,8 @@ def test_describe_shows_the_picture_with_its_line_and_closes_it(monkeypatch):
     shown = []
     monkeypatch.setattr("IPython.get_ipython", lambda: object())
     monkeypatch.setattr("IPython.display.display", shown.append)
-    figure = plots.trajectories([0, 1], [1, 2])
-    plots.describe(figure, 'A line rises from 1 to 2: "fast" & <steep>.')
+    figure = figures.trajectories([0, 1], [1, 2])
+    figures.describe(figure, 'A line rises from 1 to 2: "fast" & <steep>.')
     (picture,) = shown
     bundle = picture._repr_mimebundle_()
     assert (
@@ -93,7 +93,7 @@ def test_describe_shows_the_picture_with_its_line_and_closes_it(monkeypatch):
 @pytest.mark.parametrize("text", ["", "  ", "two\nlines"])
 def test_a_description_is_one_line(text):
     with pytest.raises(ValueError, match="one line that describes"):
-        plots.describe(plots.trajectories([0, 1], [1, 2]), text)
+        figures.describe(figures.trajectories([0, 1], [1, 2]), text)
 
 
 def test_colors_stay_apart_in_gray_and_for_the_color_blind():
@@ -102,7 +102,7 @@ def test_colors_stay_apart_in_gray_and_for_the_color_blind():
     deuteranope = np.array(
         [[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1]]
     )
-    rgb = np.array([mpl.colors.to_rgb(c) for c in plots.CYCLE[:6]])
+    rgb = np.array([mpl.colors.to_rgb(c) for c in figures.CYCLE[:6]])
     seen = np.clip(rgb**2.2 @ deuteranope.T, 0, 1) ** (1 / 2.2)
     apart = np.linalg.norm(seen[:, None] - seen[None], axis=-1) + np.eye(6)
     assert apart.min() > 0.12
@@ -110,7 +110,7 @@ def test_colors_stay_apart_in_gray_and_for_the_color_blind():
 
 def test_the_envelope_bounds_what_contracts_at_its_rate():
     t, paths = spiral()
-    figure = plots.convergence(t, paths, rate=0.5)
+    figure = figures.convergence(t, paths, rate=0.5)
     lines = figure.axes[1].get_lines()
     envelope = np.asarray(lines[-1].get_ydata(), float)
     assert lines[-1].get_label() == "rate 0.5 1/s"
@@ -120,12 +120,12 @@ def test_the_envelope_bounds_what_contracts_at_its_rate():
 
 def test_zero_entries_are_written_as_zero_and_stay_white():
     F = np.array([[2.0, 1e-14], [-1.0, 0.5]])
-    figure = plots.matrix(F)
+    figure = figures.matrix(F)
     assert [t.get_text() for t in figure.axes[0].texts] == ["2", "0", "-1", "0.5"]
 
 
 def test_a_histogram_counts_every_sample():
-    figure = plots.histogram(
+    figure = figures.histogram(
         {"a": [-50.0, 0.1, 0.2, 99.0]}, label_x="e", bins=np.linspace(-1, 1, 5)
     )
     heights = [p.get_data().values for p in figure.axes[0].patches]
@@ -135,7 +135,7 @@ def test_a_histogram_counts_every_sample():
 def test_learning_curves_show_median_and_range_over_seeds():
     steps = np.arange(4.0)
     runs = np.array([[0.0, 1, 2, 3], [10, 11, 12, 13], [2, 3, 4, 5]])
-    ax = plots.learning_curves(steps, {"m": runs}, each_seed=False).axes[0]
+    ax = figures.learning_curves(steps, {"m": runs}, each_seed=False).axes[0]
     np.testing.assert_allclose(ax.get_lines()[0].get_ydata(), runs[2])
     low, high = ax.collections[0].get_paths()[0].vertices[:, 1].min(), 13
     assert (low, high) == (0.0, ax.collections[0].get_paths()[0].vertices[:, 1].max())
@@ -145,14 +145,20 @@ def test_learning_curves_show_median_and_range_over_seeds():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: plots.phase_portrait(np.zeros((5, 2)), np.zeros((5, 2))), r"use grid\(\)"),
-        (lambda: plots.phase_portrait(paths=np.zeros(5)), "wanted trajectories"),
-        (lambda: plots.convergence([0, 1], np.zeros((2, 3, 1))), "wanted trajectories"),
-        (lambda: plots.matrix(np.zeros(3)), r"wanted a matrix \(rows, columns\)"),
-        (lambda: plots.matrices({}), "at least one matrix"),
-        (lambda: plots.eigenvalues([1.0], region="circle"), "'half-plane' or 'disc'"),
-        (lambda: plots.learning_curves([0, 1], {"a": np.zeros((3, 4))}), r"a: wanted \(seeds, 2\)"),
-        (lambda: plots.region([0, 1], [0, 1], np.zeros((3, 2)), labels=("", "", "")), "got shape"),
+        (lambda: figures.phase_portrait(np.zeros((5, 2)), np.zeros((5, 2))), r"use grid\(\)"),
+        (lambda: figures.phase_portrait(paths=np.zeros(5)), "wanted trajectories"),
+        (lambda: figures.convergence([0, 1], np.zeros((2, 3, 1))), "wanted trajectories"),
+        (lambda: figures.matrix(np.zeros(3)), r"wanted a matrix \(rows, columns\)"),
+        (lambda: figures.matrices({}), "at least one matrix"),
+        (lambda: figures.eigenvalues([1.0], region="circle"), "'half-plane' or 'disc'"),
+        (
+            lambda: figures.learning_curves([0, 1], {"a": np.zeros((3, 4))}),
+            r"a: wanted \(seeds, 2\)",
+        ),
+        (
+            lambda: figures.region([0, 1], [0, 1], np.zeros((3, 2)), labels=("", "", "")),
+            "got shape",
+        ),
         (lambda: schematics.combination("serial"), "got 'serial'"),
         (lambda: schematics.recursion(1), "2 to 6 subsystems"),
         (lambda: schematics.one_network_per_dimension(0), "at least one dimension"),
@@ -168,4 +174,4 @@ def test_the_style_leaves_other_figures_to_the_reader():
     with mpl.rc_context():
         mpl.rcdefaults()
         style.use_style()
-        assert mpl.rcParams["axes.prop_cycle"].by_key()["color"][0] == plots.COLORS["blue"]
+        assert mpl.rcParams["axes.prop_cycle"].by_key()["color"][0] == figures.COLORS["blue"]
