@@ -42,8 +42,7 @@ def drive(task, ticks, seed=0, start=0):
     for k in range(start, start + ticks):
         if k % c.horizon == 0:
             task.set_subgoal(rng.uniform(c.subgoal_low, c.subgoal_high, (task.num, c.high_size)))
-        u = rng.uniform(-1, 1, (task.num, c.low_size)) * np.array(c.u_limit)
-        seen.append(task.step(u))
+        seen.append(task.step(rng.uniform(-1, 1, (task.num, c.low_size))))
     return seen
 
 
@@ -164,7 +163,7 @@ def test_latent_signal_and_integral_are_what_they_are_called(name):
         previous = previous + 0.02 * y * [1, 1, 1, 0, 0, 0]
         np.testing.assert_allclose(field["integral"], previous, atol=1e-12)
         assert field["time_to_go"] == pytest.approx(0.4 - 0.02 * (k % 20))
-        obs = task.step(rng.uniform(-1, 1, (4, 6)) * np.array(c.u_limit))[0]
+        obs = task.step(rng.uniform(-1, 1, (4, 6)))[0]
     assert task.select(obs, ACTOR).shape == (4, 12)
     assert task.select(obs, CRITIC).shape == (4, 25)
     assert task.select(obs, task.high_level).shape == (4, 15 if name != "push" else 21)
@@ -183,7 +182,7 @@ def test_two_level_actions_latch_the_sub_goal(name):
     rng = np.random.default_rng(0)
     c = task.config
     for k in range(42):
-        u = rng.uniform(-1, 1, c.low_size) * np.array(c.u_limit)
+        u = rng.uniform(-1, 1, c.low_size)
         subgoal = rng.uniform(c.subgoal_low, c.subgoal_high)
         if k % c.horizon == 0:
             task.set_subgoal(subgoal[None])
@@ -240,7 +239,7 @@ def test_actions_beyond_the_bounds_are_clipped(name):
     size = far.config.low_size
     np.testing.assert_array_equal(
         far.step(np.full((1, size), 1e9))[0],
-        edge.step(np.array(edge.config.u_limit)[None])[0],
+        edge.step(np.ones((1, size)))[0],
     )
 
 

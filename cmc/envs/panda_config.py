@@ -30,7 +30,7 @@ class PandaTaskConfig:
         workspace_low, workspace_high: box that sub-goals are clamped to: positions (3,), m, or
             joint angles relative to the start (7,), rad.
         tilt_limit: largest rotation of the target from pointing straight down, rad.
-        u_limit: bounds of the low-level action, (6,) m/s^2 and rad/s^2, or (7,) N m.
+        u_limit: what a low-level action of 1 means, (6,) m/s^2 and rad/s^2, or (7,) N m.
         joint_stiffness: K_p of the joint controller, N m/rad ("joint" only).
         horizon: ticks between sub-goals.
         ticks: length of an episode.

@@ -17,7 +17,7 @@ from cmc.envs.panda_task import Array, Mask, PandaTask, checked
 Observation = NDArray[np.float32]
 ActionMode = Literal["two_level", "low", "high"]
 LowLevel = Callable[[Array, Array], ArrayLike]
-"""Low-level policy: y (N, 6) and its integral (N, 6) to u (N, 6)."""
+"""Low-level policy: y (N, 6) and its integral (N, 6) to actions (N, 6) in [-1, 1]."""
 
 
 _SCALARS = ("contact_force", "contact_force_max", "penetration", "success")
@@ -41,7 +41,7 @@ class ActionInterface:
         self.task, self.mode, self._low_level = task, mode, low_level
         c = task.config
         high = np.array([c.subgoal_low, c.subgoal_high])
-        low = np.array([np.negative(c.u_limit), c.u_limit])
+        low = np.array([[-1.0], [1.0]]) * np.ones(c.low_size)
         both = {"two_level": np.hstack([low, high]), "low": low, "high": high}[mode]
         self.space: Any = spaces.Box(*both.astype(np.float32))
         self._split = c.low_size

@@ -68,8 +68,7 @@ class PandaTask:
         # mapping_pos: y = K1 e + K2 e', with e' = -velocity because a sub-goal is at rest
         self._to_latent = np.vstack([np.diag(latent.K1), -np.diag(latent.K2)])
         self._sum = np.repeat([config.tick, 0.0], 3)  # the integral acts on translation only
-        self._u_high = np.tile(np.array(config.u_limit), (num, 1))
-        self._u_low = -self._u_high
+        self._u_limit = np.array(config.u_limit)
         self._action = np.zeros((num, config.low_size))
         self._high_low, self._high_high = (
             np.array(config.subgoal_low),
@@ -200,7 +199,7 @@ class PandaTask:
         """One tick of 20 ms.
 
         Args:
-            u: low-level actions (N, low_size), clipped to `u_limit`.
+            u: low-level actions (N, low_size) in units of `u_limit`, clipped to [-1, 1].
 
         Returns:
             Observations (N, size), reward (N,), terminated (never), truncated (time is up), info:
@@ -209,8 +208,8 @@ class PandaTask:
             (N), `penetration` (m, deepest of the tick), `success`.
         """
         action = checked(u, (self.num, self.config.low_size), "low-level action")
-        action = np.maximum(action, self._u_low, out=self._action)
-        np.minimum(action, self._u_high, out=action)
+        action = np.clip(action, -1.0, 1.0, out=self._action)
+        action *= self._u_limit
         worlds = self.worlds
         if self.config.command == "pose":
             worlds.tick_pose(self.target, self._target_quat, action)

@@ -81,7 +81,7 @@ class PegMazeEnv(PandaEnv):
 
     | Num | Action (action_mode "two_level")    | Min               | Max              | Unit    |
     |-----|-------------------------------------|-------------------|------------------|---------|
-    | 0-2 | u, translation                      | -1 (soft: -0.2)   | 1 (soft: 0.2)    | m/s^2   |
+    | 0-2 | u, translation                      | -1                | 1                | 1 m/s^2 (soft: 0.2) |
     | 3-5 | u, rotation                         | -1                | 1                | rad/s^2 |
     | 6-8 | sub-goal: absolute tip position     | .40, -.03, -.005  | .43, -.015, .015 | m       |
 
@@ -89,7 +89,7 @@ class PegMazeEnv(PandaEnv):
     6-8 and lasts 20 ticks. Actions outside the bounds are clipped; NaN, infinity and wrong shapes
     raise ValueError. The sub-goal's orientation is straight down.
 
-    Regime "joint": u is 7 joint torques (N m, at most 0.3), applied as |u| towards the sub-goal, and
+    Regime "joint": u is 7 joint torques (in units of 0.3 N m), applied as |u| towards the sub-goal, and
     the sub-goal is 7 joint increments from the current pose (at most 0.1 rad), clamped to the
     joint limits; torque = 1 N m/rad (q_d - q) + u + gravity and Coriolis terms.
 

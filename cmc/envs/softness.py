@@ -33,9 +33,9 @@ WALLS = {  # axis: where the tip starts, and the sub-goal behind the wall
 
 
 def low_level(config: PandaTaskConfig, gain: float = GAIN) -> LowLevel:
-    """A fixed odd policy with positive slopes, u = b tanh(g (y + int y) / b) within bounds b."""
+    """A fixed odd policy with positive slopes, u = b tanh(g (y + int y) / b), in units of b."""
     bound, slope = np.array(config.u_limit), gain * np.array([1.0] * 3 + [0.1] * 3)
-    return lambda y, integral: bound * np.tanh(slope * (y + integral) / bound)
+    return lambda y, integral: np.tanh(slope * (y + integral) / bound)
 
 
 def measure_softness(worlds: int = 32, ticks: int = 1200, seed: int = 0) -> dict[str, Any]:

@@ -240,14 +240,13 @@ def rollout(
     views, actions, forces = [], [], []
     terms: dict[str, list[Array]] = {}
     total = np.zeros(task.num)
-    limit = np.array(task.config.u_limit)
     over = False
     fields = low_fields(task)
     seen = task.select(obs, fields).reshape(*shape, -1)
     views.append(seen)
     for _ in range(task.config.horizon):
         action = low.act(seen, explore)
-        obs, reward, _, truncated, info = task.step(action.reshape(task.num, -1) * limit)
+        obs, reward, _, truncated, info = task.step(action.reshape(task.num, -1))
         total += reward
         seen = task.select(obs, fields).reshape(*shape, -1)
         views.append(seen)

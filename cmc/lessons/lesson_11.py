@@ -67,7 +67,7 @@ def straight(regime: str = "soft", worlds: int = 8) -> dict[str, Array]:
 def _tick(task: PandaTask, low: LowLevel, obs: Array) -> tuple[Array, dict[str, Any]]:
     """One tick of all worlds under a low level of one seed, without exploration."""
     u = low.act(task.select(obs, low_fields(task))[None], explore=False)[0]
-    obs, *_, info = task.step(u * np.array(task.config.u_limit))
+    obs, *_, info = task.step(u)
     return obs, info
 
 
@@ -171,7 +171,7 @@ def arm_step(
         u = low.act(task.select(obs, low_fields(task))[None], explore=False)[0]
         errors.append(MM * float(first[0, k] + step[k] - task.worlds.tip[0, k]))
         actions.append(float(u[0, k]) * task.config.u_limit[k])
-        obs, *_ = task.step(u * np.array(task.config.u_limit))
+        obs, *_ = task.step(u)
     return {
         "t": task.config.tick * np.arange(len(errors)),
         "e": -np.array(errors),

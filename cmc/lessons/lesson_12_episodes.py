@@ -70,7 +70,7 @@ def episodes(name: str, step: int | None = None, starts: int = 1) -> dict[str, A
     seeds = len(record["seeds"])
     task = PegPush(PUSH, num=seeds * starts)
     task.seed([TEST_SEED + k for _ in range(seeds) for k in range(starts)])
-    planning, limit, fields = STUDY.planning(), np.array(PUSH.u_limit), low_fields(task)
+    planning, fields = STUDY.planning(), low_fields(task)
     shape, rows, obs = (seeds, starts, -1), [], task.reset()
     total, deepest = np.zeros(task.num), np.zeros(task.num)
     touched = np.zeros(task.num, dtype=bool)
@@ -84,7 +84,7 @@ def episodes(name: str, step: int | None = None, starts: int = 1) -> dict[str, A
             now = (task.worlds.tip, task.target, task.worlds.qpos, task.worlds.force)
             rows.append([part.copy() for part in now])
             u = low.act(task.select(obs, fields).reshape(shape), explore=False)
-            obs, reward, _, _, info = task.step(u.reshape(task.num, -1) * limit)
+            obs, reward, _, _, info = task.step(u.reshape(task.num, -1))
             total += reward
             touched |= info["success"]
             deepest = np.maximum(deepest, info["penetration"])

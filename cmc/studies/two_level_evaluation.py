@@ -63,7 +63,7 @@ def run_episodes(
         start: seed of the first test world.
     """
     task = study.task_class(study.task, num=seeds * episodes, seed=start)
-    planning, limit = study.planning(), np.array(study.task.u_limit)
+    planning = study.planning()
     obs = task.reset()
     shape = (seeds, episodes)
     total, deepest = np.zeros(task.num), np.zeros(task.num)
@@ -76,7 +76,7 @@ def run_episodes(
             aim = planning.subgoal(evaluate(planner, seen))
             obs = task.set_subgoal(aim.reshape(task.num, -1))
         u = low.act(task.select(obs, fields).reshape(*shape, -1), explore=False)
-        obs, reward, _, _, info = task.step(u.reshape(task.num, -1) * limit)
+        obs, reward, _, _, info = task.step(u.reshape(task.num, -1))
         missing = task.select(obs, ("goal",)) - task.select(obs, ("position",))
         distance = np.sqrt((missing**2).sum(-1))
         total += reward
@@ -225,13 +225,12 @@ def _ticks(
     push: Array | None = None,
 ) -> None:
     """One segment; a push (worlds, 3), N, follows the tip."""
-    limit = np.array(study.task.u_limit)
     for _ in range(study.task.horizon):
         if push is not None:
             task.worlds.push(push)
         seen = task.select(obs, low_fields(task)).reshape(seeds, task.num // seeds, -1)
         u = low.act(seen, explore=False)
-        obs, *_ = task.step(u.reshape(task.num, -1) * limit)
+        obs, *_ = task.step(u.reshape(task.num, -1))
 
 
 def slope_at_rest(study: TwoLevelStudy, low: LowLevel, seeds: int, eps: float = 1e-4) -> Array:

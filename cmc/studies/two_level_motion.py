@@ -50,7 +50,7 @@ def motion(
     title, study = study.method(name).title, study.of(name)
     task = study.task_class(study.task, num=seeds)
     task.seed([TEST_SEED + episode] * seeds)
-    planning, limit, fields = study.planning(), np.array(study.task.u_limit), low_fields(task)
+    planning, fields = study.planning(), low_fields(task)
     with single_thread():
         obs, rows = task.reset(), []
         success, touched = False, False
@@ -62,7 +62,7 @@ def motion(
             now = (task.worlds.qpos, task.worlds.tip, task.target, task.worlds.force)
             rows.append([part[seed].copy() for part in now])
             u = low.act(task.select(obs, fields).reshape(seeds, 1, -1), explore=False)
-            obs, *_, info = task.step(u.reshape(seeds, -1) * limit)
+            obs, *_, info = task.step(u.reshape(seeds, -1))
             success = bool(info["success"][seed])
             touched |= success
     qpos, tip, target, force = (np.array(part) for part in zip(*rows, strict=True))
