@@ -20,6 +20,7 @@ _SUBMODULES = (
     "notation",
     "plants",
     "policies",
+    "results",
     "robot",
     "sb3",
     "store",

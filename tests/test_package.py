@@ -20,6 +20,7 @@ ORDER = [
     "lessons",
     "sb3",
     "studies",
+    "results",
     "learning",
     "envs",
     "robot",

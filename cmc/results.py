@@ -1,0 +1,270 @@
+"""Results of the studies as tidy tables, and intervals over seeds.
+
+    data = tidy("peg_push")                       # a row for each method, kept policy and seed
+    share(at(data), "success")                    # last policies: percent, interval over seeds
+    compare(at(data), [("ctd3", "control", "success"), ("ctd3", "gain", "return")])
+
+A seed is one training, and the unit of every interval and test: the episodes of one seed share its
+policy, so pooling them would count one training a hundred times. With five seeds the smallest
+possible p-value of a comparison is 2/252 = .008; an interval without width says that these seeds
+agree, not that every other would.
+
+Columns of `tidy(study)`; other tables are described in `TABLES`:
+
+| column | what it is |
+|---|---|
+| method, title | its name in `python -m cmc list`, and in figures |
+| test | "nominal", or the change of the plant that the policy is tested under |
+| step, episode | when the policy was kept, steps or episodes of each seed; 0: fixed gains |
+| last | whether it is the method's last kept policy |
+| seed | of the training |
+| episodes, trajectories | how many the row is about |
+| return | mean sum of rewards |
+| success, touched | share of episodes with the tip in the goal at the last tick, at any tick |
+| passed_by | share of episodes that touched and were elsewhere at the last tick |
+| nearest_mm, final_mm | median distance to the goal, smallest and at the end, mm |
+| deepest_mm, median_deepest_mm | deepest penetration, of all episodes and median of theirs, mm |
+| no_contact, below_1_N, below_5_N | share of ticks by the largest force in a tick |
+| largest_N | largest force, N; these four with `_50hz` look at the end of each tick only |
+| moved_mm, moved_x_mm, ... | mean displacement for a step of 5 mm along -x: along it, in x, y, z |
+| starts_mm, push_mm | spread of that displacement over starts; moved by a push of 2 N, mm |
+| slope_x, ... slope_rz | du/dy at rest; peg touch: bound of k1 + (h/2) k2 |
+| cap_x, ... cap_rz | what construction keeps that slope below |
+| h | control period, s (peg touch, as all below) |
+| oscillation, drift, offset | share of trajectories that the detectors flag, at most one each |
+| error_x, error_f, error_f_90 | median error, m and N, and the 90 % quantile of the force's, N |
+| wrong_sign_signal, wrong_sign_integral | share of visited states with a negative slope |
+| prediction | "weights" or "visited": from what oscillation is predicted |
+| predicted_oscillation, agreement | share predicted, and share of trajectories predicted rightly |
+| reachable | share of targets that the policy has an equilibrium for |
+
+`data.attrs` is the record of the file: study, command, commit, versions. Columns that it names
+under `pooled` are known for all seeds together only and the same in each seed's row (but for tests
+under other contact).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+from scipy import stats
+
+from cmc import store
+
+TABLES = {
+    "tests": "a row for each method, test, kept policy and seed",
+    "curves": "training: `reward` a tick or `return` of an episode by step or episode, smoothed",
+    "episodes": "test episodes of the last policies: `nearest_mm`, `final_mm`",
+    "picked": "policies picked on earlier tests, one for each seed, judged on fresh starts",
+    "histograms": "peg touch: `count` of trajectories of all seeds by mean force error, N",
+    "certificates": "peg touch: what holds for a kept policy, from its weights",
+}
+"""Tables of a study; not every study has all."""
+RESAMPLES = 9999
+"""Bootstrap samples; drawn from the same stream in every call."""
+
+
+def tidy(study: str, table: str = "tests") -> pd.DataFrame:
+    """A table of shipped results; the module's docstring lists the columns.
+
+    Args:
+        study: its name.
+        table: one of `TABLES`.
+
+    Raises:
+        ValueError: if there is no such table of this study, or the file is damaged.
+    """
+    if table not in TABLES:
+        raise ValueError(f"table: wanted one of {', '.join(TABLES)}, got {table!r}")
+    try:
+        return read(store.asset("results", _file(study, table)))
+    except FileNotFoundError:
+        there = {path.stem for path in store.asset("results").glob("*.csv")}
+        raise ValueError(
+            f"no results {_file(study, table)!r} are shipped; there are {', '.join(sorted(there))}"
+        ) from None
+
+
+def _file(study: str, table: str) -> str:
+    return f"{study}.csv" if table == "tests" else f"{study}_{table}.csv"
+
+
+def read(path: str | Path) -> pd.DataFrame:
+    """A table and its record (`attrs`) from a file that `write` made.
+
+    Raises:
+        ValueError: if the first line is no record.
+    """
+    with Path(path).open(encoding="utf-8") as file:
+        first = file.readline()
+        try:
+            record = json.loads(first.removeprefix("#"))
+        except json.JSONDecodeError as error:
+            raise ValueError(f"{path}: wanted a record in the first line, got {first!r}") from error
+        data = pd.read_csv(file)
+    data.attrs = record
+    return data
+
+
+def write(
+    folder: str | Path, table: str, rows: Iterable[Mapping[str, Any]], record: Mapping[str, Any]
+) -> Path:
+    """Write rows as a table of `record["study"]`: CSV, six digits, below a line with the record."""
+    text = pd.DataFrame(list(rows)).to_csv(index=False, float_format="%.6g", lineterminator="\n")
+    head = json.dumps(dict(record), allow_nan=False)
+    path = Path(folder) / _file(record["study"], table)
+    return store.write_atomic(path, lambda file: file.write(f"# {head}\n{text}".encode()))
+
+
+def at(
+    data: pd.DataFrame, when: int | None = None, *, test: str = "nominal", h: float = 0.01
+) -> pd.DataFrame:
+    """Rows of one test and one kept policy of each method: a row for each method and seed.
+
+    Args:
+        data: what `tidy` answers.
+        when: step or episode of the policy; the last one if None. Fixed gains are always there.
+        test: the test.
+        h: control period of the test, s, where there are several.
+    """
+    time = "step" if "step" in data else "episode"
+    chosen = data[time].isin([when, 0]) if when is not None else data["last"]
+    chosen &= data["test"] == test
+    return data[chosen & (data["h"] == h)] if "h" in data else data[chosen]
+
+
+def spread(
+    data: pd.DataFrame, key: str, by: str | Sequence[str] = "method", level: float = 0.95
+) -> pd.DataFrame:
+    """Mean over seeds of a figure, its bootstrap interval, smallest and largest seed.
+
+    Args:
+        data: one row for each seed in each group.
+        key: the figure's column.
+        by: columns that make the groups.
+        level: of the interval.
+
+    Returns:
+        By group `mean`, `low`, `high` (percentile bootstrap over seeds; NaN for one seed), `least`,
+        `largest` and `seeds`, their number. Groups without the figure are left out.
+
+    Raises:
+        ValueError: if a seed has several rows in a group.
+    """
+    keys = [by] if isinstance(by, str) else [*by]
+    data = data.dropna(subset=[key])
+    if data.duplicated([*keys, "seed"]).any():
+        raise ValueError(
+            f"wanted one row for each seed in a group by {', '.join(keys)}, got several: choose "
+            "policies and tests first (`at`), or add columns to `by`"
+        )
+    found = {group: _summary(rows[key], level) for group, rows in data.groupby(by, sort=False)}
+    answer = pd.DataFrame.from_dict(found, orient="index")
+    answer.index.names = keys
+    return answer.astype({"seeds": int}) if found else answer
+
+
+def share(
+    data: pd.DataFrame,
+    key: str = "success",
+    by: str | Sequence[str] = "method",
+    level: float = 0.95,
+) -> pd.DataFrame:
+    """`spread` of a share, in percent."""
+    answer = spread(data, key, by, level)
+    answer.loc[:, "mean":"largest"] *= 100.0  # type: ignore[misc]
+    return answer
+
+
+def against(
+    data: pd.DataFrame, arm: str, other: str, key: str = "success", level: float = 0.95
+) -> pd.Series:
+    """One method's mean over seeds minus another's.
+
+    Args:
+        data: one row for each method and seed.
+        arm: a method.
+        other: the one that it is compared with.
+        key: the figure's column.
+        level: of the interval.
+
+    Returns:
+        `difference`, `low`, `high` (percentile bootstrap over both methods' seeds) and `p`, exact
+        and two-sided: the share of all ways to deal the seeds to two methods that differ as much.
+
+    Raises:
+        ValueError: if a method is missing, or one of its seeds has several rows.
+    """
+    pair = []
+    for name in (arm, other):
+        rows = data[data["method"] == name].dropna(subset=[key])
+        if rows.empty:
+            raise ValueError(
+                f"no {key} of {name!r}; there are {', '.join(data['method'].unique())}"
+            )
+        if rows["seed"].duplicated().any():
+            raise ValueError(f"{name}: wanted one row for each seed, got several (`at` chooses)")
+        pair.append(rows[key].to_numpy(float))
+    a, b = pair
+    low, high = np.nan, np.nan
+    if min(len(a), len(b)) > 1:
+        low, high = _bootstrap((a, b), _gap, level)
+    p = stats.permutation_test((a, b), _gap, vectorized=True, n_resamples=np.inf).pvalue
+    return pd.Series({"difference": a.mean() - b.mean(), "low": low, "high": high, "p": float(p)})
+
+
+def compare(
+    data: pd.DataFrame, comparisons: Iterable[tuple[str, str, str]], level: float = 0.95
+) -> pd.DataFrame:
+    """`against` for comparisons (arm, other, key) that were named before looking.
+
+    Returns:
+        A row for each, with `p_holm`: p-values corrected by Holm for all that are in the list.
+    """
+    named = list(comparisons)
+    answer = pd.DataFrame([against(data, *three, level=level) for three in named])
+    answer.index = pd.MultiIndex.from_tuples(named, names=["method", "other", "key"])
+    return answer.assign(p_holm=holm(answer["p"]))
+
+
+def holm(p: ArrayLike) -> np.ndarray:
+    """Holm's correction: max over j <= i of (m - j) p_(j) in rising order, at most 1."""
+    p = np.asarray(p, dtype=float)
+    order = np.argsort(p)
+    rising = np.maximum.accumulate((len(p) - np.arange(len(p))) * p[order])
+    answer = np.empty_like(rising)
+    answer[order] = np.minimum(rising, 1.0)
+    return answer
+
+
+def _gap(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
+    return np.asarray(a.mean(axis=axis) - b.mean(axis=axis))
+
+
+def _summary(values: pd.Series, level: float) -> dict[str, float]:
+    x = values.to_numpy(float)
+    low, high = _bootstrap((x,), np.mean, level) if len(x) > 1 else (np.nan, np.nan)
+    ends = {"least": x.min(), "largest": x.max(), "seeds": len(x)}
+    return {"mean": x.mean(), "low": low, "high": high, **ends}
+
+
+def _bootstrap(
+    samples: tuple[np.ndarray, ...], statistic: Any, level: float
+) -> tuple[float, float]:
+    """Percentile interval; the seeds of each sample are drawn with replacement."""
+    found = stats.bootstrap(
+        samples,
+        statistic,
+        vectorized=True,
+        n_resamples=RESAMPLES,
+        confidence_level=level,
+        method="percentile",
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return float(found.low), float(found.high)
