@@ -96,16 +96,47 @@ def test_a_description_is_one_line(text):
         figures.describe(figures.trajectories([0, 1], [1, 2]), text)
 
 
+def deuteranope(colors):
+    """Colors as seen when red and green look the same."""
+    # Vienot, Brettel, Mollon (1999), on linear RGB.
+    seen = np.array([[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1]])
+    rgb = np.array([mpl.colors.to_rgb(c) for c in colors])
+    return np.clip(rgb**2.2 @ seen.T, 0, 1) ** (1 / 2.2)
+
+
 def test_colors_stay_apart_in_gray_and_for_the_color_blind():
     """Any two of the first six differ clearly, also when red and green look the same."""
-    # Vienot, Brettel, Mollon (1999): the map of a deuteranope, on linear RGB.
-    deuteranope = np.array(
-        [[0.29275, 0.70725, 0.0], [0.29275, 0.70725, 0.0], [-0.02234, 0.02234, 1]]
-    )
-    rgb = np.array([mpl.colors.to_rgb(c) for c in figures.CYCLE[:6]])
-    seen = np.clip(rgb**2.2 @ deuteranope.T, 0, 1) ** (1 / 2.2)
+    seen = deuteranope(figures.CYCLE[:6])
     apart = np.linalg.norm(seen[:, None] - seen[None], axis=-1) + np.eye(6)
     assert apart.min() > 0.12
+
+
+def test_a_method_has_one_color_and_line_wherever_it_is_drawn():
+    """By its name, its title, or a longer label; other labels get colors that are still free."""
+    blue, orange = figures.METHOD_COLORS["ctd3"], figures.METHOD_COLORS["td3"]
+    lines = {"TD3/TD3, plain critic, 200k": [1, 2], "other": [1, 1], "C-TD3": [2, 1]}
+    drawn = figures.curves([0, 1], lines, labels=("x", "y")).axes[0].get_lines()
+    assert [line.get_color() for line in drawn] == [orange, figures.CYCLE[2], blue]
+    assert [line.get_linestyle() for line in drawn] == ["--", "-", "-"]
+    assert style.method_of("TD3/C-TD3, the paper's scheme") == "ctd3_paper"
+
+
+def test_titles_are_those_of_the_studies():
+    from cmc.studies import peg_maze, peg_push
+    from cmc.studies.peg_touch_methods import METHODS
+
+    for methods in (METHODS, peg_maze.STUDY.methods, peg_push.STUDY.methods):
+        assert {n: m.title for n, m in methods.items()}.items() <= figures.METHOD_TITLES.items()
+
+
+def test_methods_of_one_study_differ_in_more_than_red_and_green():
+    """Seen by a deuteranope, two methods with one line style never have one color."""
+    for names in (list(style.METHOD_COLORS)[:10], list(style.METHOD_COLORS)[10:]):
+        for line in set(style.METHOD_LINES.values()):
+            same = [n for n in names if style.METHOD_LINES[n] == line]
+            seen = deuteranope([figures.METHOD_COLORS[n] for n in same])
+            apart = np.linalg.norm(seen[:, None] - seen[None], axis=-1) + np.eye(len(same))
+            assert apart.min() > 0.08, same
 
 
 def test_the_envelope_bounds_what_contracts_at_its_rate():

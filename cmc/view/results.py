@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.view.style import BAD, CYCLE, NEUTRAL, axes_or_new, figure_of, label
+from cmc.view.style import BAD, NEUTRAL, axes_or_new, figure_of, label, looks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,7 +21,7 @@ def curves(
     *,
     labels: tuple[str, str],
     log: str = "",
-    colors: Sequence[str] = CYCLE,
+    colors: Sequence[str] | None = None,
     title: str | None = None,
     marks: Mapping[str, float] | None = None,
     ax: Axes | None = None,
@@ -33,15 +33,14 @@ def curves(
         lines: legend entry to ordinate (points,).
         labels: axis labels with units.
         log: which axes are logarithmic: `""`, `"x"`, `"y"` or `"xy"`.
-        colors: one for each curve, in order; from the second round on the lines are dashed.
+        colors: one for each curve, in order; the method's own (`style.METHOD_COLORS`) by default.
         title: optional title.
         marks: legend entry to a level that is marked by a horizontal line.
         ax: where to draw.
     """
     ax = axes_or_new(ax)
-    for k, (name, y) in enumerate(lines.items()):
-        style = ("-", "--", "-.", ":")[(k // len(colors)) % 4]
-        ax.plot(x, y, style, color=colors[k % len(colors)], label=name)
+    for (name, y), (color, style) in zip(lines.items(), _looks(lines, colors), strict=True):
+        ax.plot(x, y, style, color=color, label=name)
     for name, level in (marks or {}).items():
         ax.axhline(level, color=NEUTRAL, ls="--", lw=1.2, label=name)
     if "x" in log:
@@ -60,7 +59,7 @@ def histogram(
     label_x: str,
     bins: int | ArrayLike = 40,
     log: bool = False,
-    colors: Sequence[str] = CYCLE,
+    colors: Sequence[str] | None = None,
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Figure:
@@ -73,19 +72,18 @@ def histogram(
         label_x: axis label with unit.
         bins: number of common bins, or their edges.
         log: draw shares on a logarithmic axis.
-        colors: one for each sample, in order.
+        colors: as in `curves`.
         title: optional title.
         ax: where to draw.
     """
     ax = axes_or_new(ax)
     flat = {name: np.ravel(np.asarray(x, float)) for name, x in samples.items()}
     edges = np.histogram_bin_edges(np.concatenate(list(flat.values())), bins)
-    for k, (name, x) in enumerate(flat.items()):
+    for (name, x), (color, style) in zip(flat.items(), _looks(flat, colors), strict=True):
         count = np.histogram(np.clip(x, edges[0], edges[-1]), edges)[0]
         share = count / max(x.size, 1)
-        color = colors[k % len(colors)]
         ax.stairs(share, edges, color=color, fill=True, alpha=0.25)
-        ax.stairs(share, edges, color=color, lw=1.8, label=name)
+        ax.stairs(share, edges, color=color, ls=style, lw=1.8, label=name)
     if log:
         ax.set_yscale("log")
     if len(flat) > 1:
@@ -100,7 +98,7 @@ def learning_curves(
     *,
     labels: tuple[str, str] = ("environment steps", "return"),
     each_seed: bool = True,
-    colors: Sequence[str] = CYCLE,
+    colors: Sequence[str] | None = None,
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Figure:
@@ -111,19 +109,19 @@ def learning_curves(
         runs: method to values (seeds, points); NaN where a seed has no value.
         labels: axis labels with units.
         each_seed: draw every seed as a thin line too.
-        colors: one for each method, in order.
+        colors: as in `curves`.
         title: optional title.
         ax: where to draw.
     """
     ax = axes_or_new(ax)
     x = np.asarray(steps, float)
-    for k, (name, values) in enumerate(runs.items()):
+    for (name, values), (color, style) in zip(runs.items(), _looks(runs, colors), strict=True):
         Y = np.atleast_2d(np.asarray(values, float))
         if Y.shape[-1] != x.size:
             raise ValueError(f"{name}: wanted (seeds, {x.size}) values, got shape {Y.shape}")
-        color = colors[k % len(colors)]
         seeds = f" ({Y.shape[0]} seeds)" if Y.shape[0] > 1 else ""
-        ax.plot(x, np.nanmedian(Y, axis=0), color=color, lw=2.2, label=f"{name}{seeds}")
+        median = np.nanmedian(Y, axis=0)
+        ax.plot(x, median, style, color=color, lw=2.2, label=f"{name}{seeds}")
         if Y.shape[0] > 1:
             low, high = np.nanmin(Y, axis=0), np.nanmax(Y, axis=0)
             ax.fill_between(x, low, high, color=color, alpha=0.15, lw=0)
@@ -173,3 +171,11 @@ def region(
     figure.colorbar(mesh, ax=ax, label=labels[2])
     label(ax, labels[0], labels[1], title)
     return figure
+
+
+def _looks(names: Iterable[str], colors: Sequence[str] | None) -> list[tuple[str, str]]:
+    """A color and a line style for each name; given colors are dashed from the second round on."""
+    if colors is None:
+        return looks(names)
+    styles = ("-", "--", "-.", ":")
+    return [(colors[k % len(colors)], styles[k // len(colors) % 4]) for k, _ in enumerate(names)]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.view.style import CYCLE, axes_or_new, figure_of, label
+from cmc.view.style import axes_or_new, figure_of, label, looks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,9 +37,8 @@ def seed_dots(
         ax: where to draw.
     """
     ax = axes_or_new(ax, (7.0, 0.9 + 0.42 * max(len(groups), 1)))
-    for row, values in enumerate(groups.values()):
+    for row, (values, (color, _)) in enumerate(zip(groups.values(), looks(groups), strict=True)):
         x = np.sort(np.asarray(values, float))
-        color = CYCLE[row % len(CYCLE)]
         ax.plot([x[0], x[-1]], [row, row], color=color, lw=1.5, alpha=0.5)
         ax.plot([x.mean()] * 2, [row - 0.3, row + 0.3], color=color, lw=2.5)
         ax.plot(x, row + 0.22 * np.linspace(-1, 1, x.size), "o", color=color, ms=5, alpha=0.8)

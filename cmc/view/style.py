@@ -9,6 +9,8 @@ from __future__ import annotations
 import base64
 import html
 import io
+import itertools
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,8 +41,68 @@ CYCLE = tuple(COLORS.values())
 GOOD, BAD, NEUTRAL = COLORS["blue"], COLORS["vermillion"], "#7A7A7A"
 """What holds, what fails, and what is only there for reference."""
 
+_METHODS = {
+    # two levels: the peg maze and the peg push
+    "ctd3": ("TD3/C-TD3", "#0072B2", "-"),
+    "ctd3_paper": ("TD3/C-TD3, the paper's scheme", "#56B4E9", "-"),
+    "frozen": ("TD3/frozen random C", "#009E73", "-"),
+    "gain": ("TD3/hand-tuned gain", "#E69F00", "-."),
+    "td3": ("TD3/TD3, plain critic", "#D55E00", "--"),
+    "td3_corrected": ("TD3/TD3, corrected critic", "#CC79A7", "--"),
+    "control": ("TD3/Control", "#222222", ":"),
+    "ppo_control": ("PPO/Control", "#7A7A7A", ":"),
+    "hiro": ("HIRO", "#5E3C99", "-."),
+    "hiro_matched": ("HIRO, matched noise", "#A79BD0", "-."),
+    # one level: the peg that touches
+    "cppo": ("C-PPO", "#0072B2", "-"),
+    "cppo_capped": ("C-PPO, capped", "#009E73", "-"),
+    "cppo_bypass": ("C-PPO, capped, vertical bypass", "#56B4E9", "-"),
+    "cppo_scaled": ("C-PPO, capped loop gain", "#117733", "-"),
+    "cppo_bounded": ("C-PPO, bounded on both sides", "#44AA99", "-"),
+    "cppo_stress": ("C-PPO, stress setting", "#332288", "-"),
+    "cppo_identity": ("C-PPO, T_y = T_a = I", "#5E3C99", "-"),
+    "cppo_no_integral": ("C-PPO, no integral", "#A79BD0", "-"),
+    "ppo": ("PPO, one network per dimension", "#D55E00", "--"),
+    "ppo_stress": ("PPO, stress setting", "#882255", "--"),
+    "ppo_joint": ("PPO, joint network", "#CC79A7", "--"),
+    "ppo_raw": ("PPO, raw inputs", "#DDAA33", "--"),
+    "convex_pi": ("Convex-gradient PI", "#E69F00", "-."),
+    "pi": ("Hand-tuned PI", "#222222", ":"),
+    "pi_scaled": ("Hand-tuned PI, scheduled on stiffness", "#7A7A7A", ":"),
+}
+METHOD_TITLES = {name: title for name, (title, _, _) in _METHODS.items()}
+"""Names of the compared methods in figures and tables."""
+METHOD_COLORS = {name: color for name, (_, color, _) in _METHODS.items()}
+"""One color a method, the same in every lesson; blue and its neighbors contract by construction."""
+METHOD_LINES = {name: line for name, (_, _, line) in _METHODS.items()}
+"""Line styles: solid contracts, dashed is free, dotted does not learn, dash-dotted is another."""
+
 _DPI = 144
 _CSS_PIXELS_PER_INCH = 84
+
+
+def method_of(label: str) -> str | None:
+    """Return the method that a label names: its name, its title, or what begins with its title."""
+    if label in _METHODS:
+        return label
+    begun = [name for name, title in METHOD_TITLES.items() if label.startswith(title)]
+    if begun:
+        return max(begun, key=lambda name: len(METHOD_TITLES[name]))
+    short = {title.split("/")[-1].split(",")[0]: n for n, title in reversed(METHOD_TITLES.items())}
+    return short.get(label)
+
+
+def looks(labels: Iterable[str]) -> list[tuple[str, str]]:
+    """Return a color and a line style for each label: its method's, or the next of the cycle."""
+    labels = list(labels)
+    methods = [method_of(label) for label in labels]
+    taken = {METHOD_COLORS[name] for name in methods if name}
+    free = itertools.cycle([c for c in CYCLE if c not in taken] or CYCLE)
+    styles = itertools.cycle(["-"] * len(CYCLE) + ["--"] * len(CYCLE))
+    return [
+        (METHOD_COLORS[name], METHOD_LINES[name]) if name else (next(free), next(styles))
+        for name in methods
+    ]
 
 
 def use_style() -> None:
