@@ -1,103 +1,151 @@
-"""Lesson 10: the bench and its pictures, against what the text says about them."""
+"""Lesson 10: what its cells define, against the library and against what the text says."""
 
 import numpy as np
 import pytest
+from lesson import lesson
 
 from cmc import exercises
-from cmc.lessons import lesson_10, panda_bench
-from cmc.robot.task_space import ControlLaw
+from cmc.robot.panda import DOWN, forward_kinematics
+from cmc.robot.task_space import MAZE_GAINS, ControlLaw, Gains, TaskSpaceController
+
+HERE = lesson("10")
+FREE = HERE["FREE"]
 
 
-def test_simulator_and_table_agree():
-    assert max(lesson_10.kinematics_check(50).values()) < 1e-12
+def states(number=5):
+    """Simulated states of the arm in motion, with what `sense` finds."""
+    rng = np.random.default_rng(0)
+    for _ in range(number):
+        model, data = HERE["world"](FREE)
+        data.qpos[:7] += 0.2 * rng.normal(size=7)
+        data.qvel[:7] = 0.3 * rng.normal(size=7)
+        yield model, data, HERE["sense"](model, data), rng.normal(size=6)
+
+
+@pytest.mark.parametrize(
+    ("cell", "law"),
+    [
+        ("force", {"form": "force"}),
+        ("acceleration", {"form": "acceleration"}),
+        ("blocks", {"form": "force", "split": True}),
+    ],
+)
+def test_the_cells_torques_are_the_librarys(cell, law):
+    for model, data, s, p in states():
+        controller = TaskSpaceController(model, MAZE_GAINS, ControlLaw(**law, pivot_floor=1e-12))
+        controller.observe(data)
+        qn = HERE["READY"] - s.q - 2.0 * s.qd
+        np.testing.assert_allclose(HERE[cell](s, p, qn), controller.torque_for(data, p), atol=1e-6)
+
+
+def test_the_cells_error_is_the_librarys_to_first_order():
+    model, data, s, _ = next(states(1))
+    data.qpos[:7] = HERE["world"](FREE)[1].qpos[:7] + 1e-4
+    s = HERE["sense"](model, data)
+    controller = TaskSpaceController(model, MAZE_GAINS)
+    controller.observe(data)
+    goal = np.array(FREE) + 0.01
+    np.testing.assert_allclose(HERE["pose_error"](s, goal), controller.error(goal, DOWN), atol=1e-9)
+
+
+def test_the_cells_kinematics_are_the_librarys():
+    for q in np.random.default_rng(0).uniform(-1, 1, (5, 7)):
+        np.testing.assert_allclose(HERE["hand"](q)[:3, 3], forward_kinematics(q)[0], atol=1e-12)
+        np.testing.assert_allclose(HERE["hand"](q)[:3, :3], forward_kinematics(q)[1], atol=1e-12)
 
 
 def test_transposed_jacobian_alone_fails_under_the_hold_only():
-    held, every = (np.abs(lesson_10.literal(e)["e"][-1, :3]).max() for e in (False, True))
-    assert every < 0.005 < 0.02 < held
+    every, held = (HERE["spring"](n)[-1] for n in (1, 10))
+    assert every < 5 < 20 < held
 
 
 @pytest.mark.parametrize("form", ["force", "acceleration"])
 def test_gains_alone_predict_the_arm(form):
-    run = lesson_10.step(
-        panda_bench.Setup("panda.xml", lesson_10.FREE.start, law=ControlLaw(form=form))
-    )
-    assert np.abs(run["e"][:, :3] - run["e_model"]).max() < 0.005 * 0.01
-    assert np.abs(run["y"][:, :3] - run["y_model"]).max() < 0.005 * np.abs(run["y"]).max()
+    run = HERE["motion"](lambda t: (0.43, -0.02, 0.05), form=HERE[form])
+    model = HERE["model_of_gains"](MAZE_GAINS, run["e"][0, :3], run["u"][:, :3])
+    assert np.abs(run["e"][:, :3] - model).max() < 0.005 * 0.01
 
 
 def test_prediction_approaches_the_continuous_solution():
-    out = lesson_10.predict(panda_bench.MAZE_GAINS, np.array([0.01, 0, 0]), np.zeros((40, 6)))
+    found = HERE["model_of_gains"](MAZE_GAINS, np.array([0.01, 0, 0]), np.zeros((40, 3)))
     p, q = np.sort(np.roots([1, 20, 40]).real)
     t = 0.02 * np.arange(40)
     exact = 0.01 * (p * np.exp(q * t) - q * np.exp(p * t)) / (p - q)
-    np.testing.assert_allclose(out["e_model"][:, 0], exact, atol=3e-4)  # 50 Hz costs 3 %
+    np.testing.assert_allclose(found[:, 0], exact, atol=3e-4)  # 50 Hz costs 3 %
 
 
 @pytest.mark.parametrize("form", ["force", "acceleration"])
 def test_null_space_needs_its_posture_term(form):
-    held, loose = (lesson_10.null_space(form, p, seconds=1.5) for p in (True, False))
-    for run in (held, loose):
+    push, stiff = np.array([1.0, 0, -1.0, 0, 0, 0, 0]), Gains(200.0, 40.0, 200.0, 40.0)
+    turned = []
+    for pull in ((1.0, 2.0), (0.0, 0.0)):
+        run = HERE["motion"](
+            lambda t: FREE, 1.5, form=HERE[form], gains=stiff, pull=pull, kick=push
+        )
         assert np.linalg.norm(run["e"][:, :3], axis=1).max() < 2e-3
-    assert np.abs(loose["joints"][-1]).max() > 2.5 * np.abs(held["joints"][-1]).max()
-
-
-def test_only_the_inertia_keeps_the_posture_torque_from_the_tip():
-    sizes = [float(np.linalg.norm(a)) for a in lesson_10.posture_torques().values()]
-    assert max(sizes[:2]) < 1e-12
-    assert 1e-4 < sizes[2] < sizes[3]
+        turned.append(np.abs(run["qpos"][-1, :7] - run["qpos"][0, :7]).max())
+    assert turned[1] > 2.5 * turned[0]
 
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 @pytest.mark.parametrize("limit", [0.2, 1.0])
 def test_pressing_force_is_mass_times_acceleration(axis, limit):
-    run = lesson_10.press(axis, limit=limit)
-    assert run["pressing"] == pytest.approx(run["predicted"], rel=0.1)
-    towards = np.array(lesson_10.WALL[axis][1])
-    assert run["force"][-1] @ towards < 0  # the wall pushes back
+    run = press(axis, limit)
+    assert np.linalg.norm(run["force"][-1]) == pytest.approx(run["formula"], rel=0.1)
+    assert run["force"][-1] @ np.array(HERE["WALL"][axis][1]) < 0  # the wall pushes back
+
+
+def press(axis, limit=1.0, **options):
+    return HERE["press"](axis, limit, **options)
 
 
 def test_softness_needs_the_spring_and_the_limits():
-    runs = lesson_10.regimes("x")
-    assert runs["spring, limits"]["impact"] < 1.0
-    assert runs["rigid, limits"]["impact"] > 3.0
-    assert runs["spring, no limits"]["pressing"] > 1.5
-    assert runs["rigid, no limits"]["impact"] > 10.0
-
-
-def test_impacts_follow_their_formulas():
-    hit = lesson_10.impacts(4)
-    np.testing.assert_allclose(hit["rigid"], hit["slope"] * hit["speed"], rtol=0.15)
-    np.testing.assert_allclose(hit["spring"], hit["spring_model"], rtol=0.25)
+    spring, soft = HERE["SPRING"], {"clip": 0.005}
+    largest = {
+        "both": press("x", 0.2, peg=spring, **soft)["peak"].max(),
+        "limits": press("x", 0.2, **soft)["peak"].max(),
+        "none": press("x")["peak"].max(),
+        "none, y": press("y")["peak"].max(),
+    }
+    assert largest["both"] < 1.0 < 3.0 < largest["limits"] < largest["none"] < largest["none, y"]
+    assert round(largest["both"], 1) == 0.8  # the two ends that the last table of the lesson names
+    assert round(largest["none, y"]) == 47
+    leaning = press("x", peg=spring)
+    assert np.linalg.norm(leaning["force"][-1]) > 1.5
 
 
 def test_slider_shows_refusal_and_chatter():
-    refused = lesson_10.response(40.0, 5.0, 20.0, 10.0, 0.0)
-    assert "12.6" in refused["text"]
-    assert np.isnan(refused["e"]).all()
-    fine = lesson_10.response(40.0, 20.0, 20.0, 10.0, 5.0)
-    assert fine["e"].shape == (40, 2)
-    assert np.abs(fine["e"][-1]).max() < 0.1
-    np.testing.assert_allclose(fine["e"][:, 0], fine["model"], atol=0.1)
-    wild = lesson_10.response(40.0, 20.0, 55.0, 10.0, 0.0)["u"][-6:]
-    assert (wild[1:] * wild[:-1] < 0).all()  # the command changes sign at every tick
-    still = lesson_10.response(40.0, 20.0, 0.0, 0.0, 0.0)
-    assert np.isfinite(still["e"]).all()
+    refused = HERE["response"](40.0, 5.0, 20.0, 10.0, 0.0)
+    assert "12.6" in refused["title"]
+    assert np.isnan(refused["x"]).all()
+    fine = HERE["response"](40.0, 20.0, 20.0, 10.0, 5.0)
+    assert abs(fine["x"][-1]) < 0.1
+    for axis in "xz":
+        np.testing.assert_allclose(fine[axis], fine[f"{axis}_model"], atol=0.1)
+    wild = HERE["response"](40.0, 20.0, 55.0, 10.0, 0.0)
+    assert "chatter" in wild["title"]
+    assert (wild["u"][-5:] * wild["u"][-6:-1] < 0).all()  # the command flips at every tick
 
 
-@pytest.mark.parametrize("soft", [False, True])
-def test_waypoints_lead_through_the_maze_without_contact(soft):
-    run = lesson_10.maze_run(soft)
-    assert run["peak"].max() == 0.0
-    assert np.linalg.norm(run["tip"][-1] - lesson_10.WAYPOINTS[-1]) < 5e-4
-
-
-def test_exercise_refuses_the_transposed_jacobian():
-    exercises.check("10-torque", lambda M, J, h, d, p: M @ np.linalg.pinv(J) @ (p - d) + h)
-    for wrong in (
-        lambda M, J, h, d, p: J.T @ p + h,
-        lambda M, J, h, d, p: M @ np.linalg.pinv(J) @ p + h,
-        lambda M, J, h, d, p: np.zeros(6),
-    ):
-        with pytest.raises(AssertionError, match="Not yet"):
-            exercises.check("10-torque", wrong)
+@pytest.mark.parametrize(
+    ("name", "wrong", "message"),
+    [
+        ("10-torque", lambda M, J, h, d, p: J.T @ p + h, "the tip acceleration"),
+        ("10-torque", lambda M, J, h, d, p: M @ np.linalg.pinv(J) @ p + h, "counts twice"),
+        ("10-torque", lambda M, J, h, d, p: M @ np.linalg.pinv(J) @ (p - d), "h is missing"),
+        (
+            "10-torque",
+            lambda M, J, h, d, p: J.T @ np.linalg.solve(J @ np.linalg.inv(M) @ J.T, p - d) + h,
+            "acceleration form",
+        ),
+        ("10-torque", lambda M, J, h, d, p: None, "None"),
+        ("10-posture", lambda M, J, q: M @ q, "does to the tip"),
+        ("10-posture", lambda M, J, q: (np.eye(7) - np.linalg.pinv(J) @ J) @ q, "does to the tip"),
+        ("10-posture", lambda M, J, q: np.zeros(7), "elbow"),
+        ("10-limit", lambda m, k, c: 1.0 / m - k * c, "7.0 kg"),
+    ],
+)
+def test_exercises_name_the_slip(name, wrong, message):
+    verdict = exercises.check(name, wrong)
+    assert not verdict
+    assert message in repr(verdict)
