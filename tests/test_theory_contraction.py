@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from cmc import plants
@@ -18,7 +17,7 @@ from cmc.theory.contraction import (
     rate_from_cloud,
     rate_from_pair,
 )
-from cmc.theory.simulate import rk4, simulate_loop
+from cmc.theory.simulate import rk4
 
 SHEARED = np.array([[-1.0, 8.0], [0.0, -1.5]])
 
@@ -142,48 +141,6 @@ def test_rk4_is_fourth_order_and_batched():
         rk4(lambda t, y: y, start, [0.0])
     with pytest.raises(ValueError, match="finite"):
         rk4(lambda t, y: y, [np.nan], [0.0, 1.0])
-
-
-def test_loop_simulation_agrees_with_an_adaptive_solver():
-    plant = plants.get("pendulum")
-
-    def command(y, I):
-        return -(1.5 * y + 0.7 * I)
-
-    path = simulate_loop(plant, command, [[0.5, 0.2], [-1.0, 0.0]], np.linspace(0, 3, 301))
-    assert path.y.shape == path.u.shape == path.integral.shape == (301, 2, 2)
-    reference = solve_ivp(
-        lambda t, s: np.concatenate([plant.f(s[:2], command(s[:2], s[2:])), s[:2]]),
-        (0, 3),
-        [-1.0, 0.0, 0, 0],
-        rtol=1e-10,
-        atol=1e-12,
-    ).y[:, -1]
-    end = np.concatenate([path.y[-1, 1], path.integral[-1, 1]])
-    np.testing.assert_allclose(end, reference, atol=1e-7)
-
-
-def test_sampled_simulation_holds_the_command_and_includes_the_new_error():
-    plant = plants.get("lags")
-
-    def command(y, I):
-        return -(0.4 * y + 0.9 * I)
-
-    h = 0.1
-    path = simulate_loop(plant, command, [1.0, -1.0], np.linspace(0, 1, 101), h=h)
-    y, I = np.array([1.0, -1.0]), np.zeros(2)
-    phi = np.exp(np.diag(plant.A) * h)
-    gain = np.diag(plant.B) / -np.diag(plant.A)
-    for k in range(10):
-        np.testing.assert_allclose(path.y[10 * k], y, atol=1e-7)
-        I = I + h * y
-        u = command(y, I)
-        np.testing.assert_allclose(path.u[10 * k : 10 * k + 10], np.tile(u, (10, 1)), atol=1e-7)
-        y = phi * y + (1 - phi) * gain * u
-    with pytest.raises(ValueError, match="multiple of the uniform step"):
-        simulate_loop(plant, command, [1.0, -1.0], np.linspace(0, 1, 101), h=0.015)
-    with pytest.raises(ValueError, match="start needs shape"):
-        simulate_loop(plant, command, [1.0], np.linspace(0, 1, 101))
 
 
 def test_van_der_pol_does_not_contract_and_the_two_attractor_loop_neither():

@@ -9,6 +9,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cmc.theory.auxiliary import AuxiliarySpace, decompose
+from cmc.theory.simulate import equilibrium
+
 Array = NDArray[np.float64]
 
 
@@ -52,18 +55,14 @@ class Plant(ABC):
         """Jacobian of `f` in the command, (..., n, n)."""
 
     def hold(self, y: ArrayLike, t: float = 0.0) -> Array:
-        """Command that holds the plant still at `y`: the root u of f(y, u, t) = 0, (..., n).
+        """Command that holds the plant still at `y`; see `cmc.theory.simulate.equilibrium`."""
+        return equilibrium(self, y, t)
 
-        Every plant here is affine in its command, so the root is -f_u^-1 f(y, 0, t).
-
-        Raises:
-            numpy.linalg.LinAlgError: where f_u is singular.
-        """
-        y = np.asarray(y, dtype=float)
-        zero = np.zeros_like(y)
-        drift = self.f(y, zero, t)
-        held = np.linalg.solve(self.f_u(y, zero, t), drift[..., None])[..., 0]
-        return -held.astype(np.float64)
+    def space(self, y: ArrayLike = 0.0, u: ArrayLike = 0.0) -> AuxiliarySpace:
+        """`decompose` of f_y and f_u at a state and a command, numbers or (..., n)."""
+        at = [np.asarray(value, dtype=float) for value in (y, u)]
+        y, u = (np.broadcast_to(v, (self.n,)) if v.ndim == 0 else v for v in at)
+        return decompose(self.f_y(y, u), self.f_u(y, u))
 
     def _pair(self, y: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
         """Check the last axes and broadcast the batch axes of `y` and `u`."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cmc.theory.arrays import checked
 from cmc.theory.spectrum import (
     CHUNK,
     MAX_CONDITION,
@@ -124,6 +125,23 @@ class AuxiliarySpace:
     def to_u(self, a: ArrayLike) -> Array:
         """Return `u = T_a a` for `a` of shape (..., n)."""
         return np.einsum("...ij,...j->...i", self.T_a, np.asarray(a, dtype=np.float64))
+
+    def signed(self, k1: ArrayLike, k2: ArrayLike) -> Array:
+        """Slopes of sizes `k1` in z and `k2` in int z against the sign of R_ii, (..., n, 2)."""
+        sizes = np.stack(np.broadcast_arrays(k1, k2, self.gains)[:2], axis=-1)
+        return -np.sign(self.gains)[..., None] * sizes  # constraint_sign
+
+    def loop(self, slopes: ArrayLike) -> Array:
+        """Jacobian of the loop in (z, int z) [1/s] for signed slopes (..., n, 2): (..., 2n, 2n).
+
+        [[Lambda + R P, R Q], [I, 0]], P and Q the diagonal matrices of the slopes.
+        """
+        s, n = checked("slopes", slopes, "... n 2", n=self.n), self.n
+        P, Q = s[..., None, :, 0], s[..., None, :, 1]
+        top = np.concatenate(np.broadcast_arrays(self.Lambda + self.R * P, self.R * Q), axis=-1)
+        J = np.zeros((*top.shape[:-2], 2 * n, 2 * n))
+        J[..., :n, :], J[..., n:, :n] = top, np.eye(n)
+        return J
 
 
 def decompose(f_y: ArrayLike, f_u: ArrayLike) -> AuxiliarySpace:

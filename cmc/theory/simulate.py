@@ -1,45 +1,108 @@
-"""Fixed-step simulation of a plant, alone or in a loop with integral action.
+"""Simulate a plant under a policy: continuous or with a held command, many starts in one call.
 
-Everything is batched: a cloud of trajectories costs one call. The fixed step keeps pairs of
-trajectories comparable sample by sample, which the measured rates of `contraction` rely on.
+    z = T_y (y - y_ref),   I' = z,   a = pi(z, I),   u = u0 + T_a a,   y' = f(y, u, t)
+
+The step size is chosen for the whole batch at once, so that trajectories stay comparable sample by
+sample. `cmc.theory.exact` differentiates the same loop, and so cannot speak of another one.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from scipy.linalg import expm
 
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array, checked, number
+from cmc.theory.auxiliary import AuxiliarySpace, decompose
 
+Transforms = Callable[[Array], AuxiliarySpace]
+Action = Callable[[Array, Array], Array]
 
-class Dynamics(Protocol):
-    """Anything with y' = f(y, u, t), `cmc.plants` among them."""
-
-    n: int
-
-    def f(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> Array:
-        """Time derivative, (..., n)."""
+_MOST_STEPS = 100_000
+# Dormand and Prince 1980: y + h sum b_i k_i of order 5; _E is its difference to order 4.
+_A = (
+    (1 / 5,),
+    (3 / 40, 9 / 40),
+    (44 / 45, -56 / 15, 32 / 9),
+    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
+    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
+    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
+)
+_C = (0.2, 0.3, 0.8, 8 / 9, 1.0, 1.0)
+_E = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
 
 
 @dataclass(frozen=True)
 class Path:
-    """A simulated loop.
+    """Trajectories of a loop, (time, ..., n) each.
 
     Attributes:
-        times: (T,), s.
-        y: Latent signal, (T, ..., n).
-        u: Command applied from each time on, (T, ..., n).
-        integral: Integral of the policy's signal, (T, ..., n).
+        t: Times, s, (time,).
+        y: Latent signal.
+        z: Auxiliary signal T_y (y - y_ref).
+        integral: int z dt.
+        u: Command that acts from each time on.
     """
 
-    times: Array
+    t: Array
     y: Array
-    u: Array
+    z: Array
     integral: Array
+    u: Array
+
+
+def flow(
+    rhs: Callable[[float, Array], Array], start: ArrayLike, t: ArrayLike, *, tol: float = 1e-8
+) -> Array:
+    """Solve s' = rhs(t, s) by Dormand and Prince's adaptive method, one step size for the batch.
+
+    Args:
+        rhs: Right-hand side, (..., n) to (..., n).
+        start: States at t[0], (..., n).
+        t: Increasing times at which the states are wanted, s, (time,).
+        tol: Largest error of a step, relative to the largest size of that signal so far.
+
+    Returns:
+        States, (time, ..., n).
+
+    Raises:
+        ValueError: If times do not increase, the start is not finite, or the states explode or
+            are so stiff that more than 100,000 steps would be needed.
+    """
+    times, s = checked("t", t, "time"), checked("start", start, "... n").copy()
+    if len(times) < 2 or not (np.diff(times) > 0).all():
+        raise ValueError(f"t needs at least 2 increasing values, got {times}")
+    path = np.empty((len(times), *s.shape))
+    path[0], now, step, steps = s, float(times[0]), float(times[1] - times[0]), 0
+    batch, first = tuple(range(s.ndim - 1)), rhs(now, s)
+    largest = np.abs(s).max(axis=batch, initial=0.0)
+    for i, end in enumerate(times[1:], 1):
+        while now < end:
+            h, k = min(step, end - now), [first]
+            with np.errstate(over="ignore", invalid="ignore"):
+                for row, c in zip(_A, _C, strict=True):
+                    new = s + h * sum(a * d for a, d in zip(row, k, strict=True) if a)
+                    k.append(rhs(now + c * h, new))
+                error = h * sum(e * d for e, d in zip(_E, k, strict=True) if e)
+                size = np.maximum(largest, np.abs(new).max(axis=batch, initial=0.0))
+                size = np.maximum(size, 1e-6 * size.max()) + 1e-300
+                worst = float(np.max(np.abs(error) / (tol * size), initial=0.0))
+            if worst <= 1.0:
+                now = float(end) if h == end - now else now + h
+                s, first, largest = new, k[-1], size
+            elif steps > _MOST_STEPS or h < 1e-13 * max(abs(now), end - times[0]):
+                raise ValueError(f"the states explode or are too stiff to follow at t = {now:.6g}")
+            steps += 1
+            if h == step or worst > 1.0:  # not where the end of the interval cut the step short
+                step = h * float(np.clip(0.9 * max(worst, 1e-9) ** -0.2, 0.1, 5.0))
+                step = step if np.isfinite(worst) else 0.1 * h
+        path[i] = s
+    return path
 
 
 def rk4(rhs: Callable[[float, Array], Array], start: ArrayLike, times: ArrayLike) -> Array:
@@ -77,74 +140,234 @@ def _rk4_step(rhs: Callable[[float, Array], Array], t: float, s: Array, h: float
     return new
 
 
-def simulate_loop(
-    plant: Dynamics,
-    command: Callable[[Array, Array], Array],
-    start: ArrayLike,
-    times: ArrayLike,
-    *,
-    signal: Callable[[Array], Array] | None = None,
-    h: float | None = None,
-    integral: ArrayLike = 0.0,
-) -> Path:
-    """Simulate u = command(y, I) with I = int signal(y) dt around a plant.
-
-    Continuous by default. With a sample time `h` the command is held between samples and the
-    integral is I_k = I_{k-1} + h z_k, the new value included; `times` then sets the steps of the
-    integrator and every one must fit into a hold: h a multiple of the (uniform) step.
+def linear_flow(A: ArrayLike, t: ArrayLike, start: ArrayLike | None = None) -> Array:
+    """Solve x' = A x exactly: x(t) = e^(A (t - t_0)) x(t_0).
 
     Args:
-        plant: Has `f(y, u, t)`.
-        command: Maps y and I, each (..., n), to u (..., n).
-        start: Initial y, (..., n).
-        times: Increasing, uniform where `h` is given, s, (T,).
-        signal: What is integrated, z(y); y itself by default.
-        h: Sample time of the zero-order hold, s; continuous without it.
-        integral: Initial I, broadcast to the shape of y.
+        A: (n, n), 1/s.
+        t: Times, s, (time,).
+        start: States at t[0], (..., n); without them the maps themselves are returned.
+
+    Returns:
+        States (time, ..., n), or maps e^(A (t - t_0)), (time, n, n).
+    """
+    A, times = checked("A", A, "n n"), checked("t", t, "time")
+    maps = expm(A * (times - times[0])[:, None, None])
+    if start is None:
+        return np.asarray(maps)
+    return np.einsum("tij,...j->t...i", maps, checked("start", start, "... n", n=len(A)))
+
+
+def equilibrium(plant: Any, y: ArrayLike, t: float = 0.0) -> Array:
+    """Command that holds a plant still at `y`: the root u of f(y, u, t) = 0, (..., n).
+
+    Newton's method with halved steps, from u = 0; one step where f is affine in u.
 
     Raises:
-        ValueError: if `h` is not a multiple of the step, or shapes do not fit.
+        ValueError: If some `y` cannot be held: f_u is singular, or no root is found.
     """
-    signal = (lambda y: y) if signal is None else signal
-    times, y0 = np.asarray(times, dtype=float), np.array(start, dtype=float)
-    if y0.ndim == 0 or y0.shape[-1] != plant.n:
-        raise ValueError(f"start needs shape (..., {plant.n}), got {y0.shape}")
-    I0 = np.broadcast_to(np.asarray(integral, dtype=float), y0.shape).copy()
-    if h is not None:
-        return _sampled(plant, command, y0, times, signal, h, I0)
-    n = plant.n
-
-    def rhs(t: float, s: Array) -> Array:
-        y, I = s[..., :n], s[..., n:]
-        return np.concatenate([plant.f(y, command(y, I), t), signal(y)], axis=-1)
-
-    path = rk4(rhs, np.concatenate([y0, I0], axis=-1), times)
-    y, I = path[..., :n], path[..., n:]
-    u = np.stack([np.broadcast_to(command(a, b), y0.shape) for a, b in zip(y, I, strict=True)])
-    return Path(times, y, u, I)
-
-
-def _sampled(
-    plant: Dynamics,
-    command: Callable[[Array, Array], Array],
-    y: Array,
-    times: Array,
-    signal: Callable[[Array], Array],
-    h: float,
-    I: Array,
-) -> Path:
-    step = float(times[1] - times[0])
-    per_hold = round(h / step)
-    if per_hold < 1 or not np.allclose(np.diff(times), step) or abs(per_hold * step - h) > 1e-9 * h:
-        raise ValueError(f"h = {h} s needs to be a multiple of the uniform step {step} s of times")
-    shape = (len(times), *y.shape)
-    ys, us, Is = np.empty(shape), np.empty(shape), np.empty(shape)
+    y = checked("y", y, "... n", n=plant.n)
     u = np.zeros_like(y)
-    for k, t in enumerate(times):
-        if k % per_hold == 0:
-            I = I + h * signal(y)
-            u = np.broadcast_to(command(y, I), y.shape)
-        ys[k], us[k], Is[k] = y, u, I
-        if k + 1 < len(times):
-            y = _rk4_step(lambda at, s, u=u: plant.f(s, u, at), float(t), y, step)  # type: ignore[misc]
-    return Path(times, ys, us, Is)
+    f = np.asarray(plant.f(y, u, t), dtype=float)
+    scale = size = np.linalg.norm(f, axis=-1)
+    for _ in range(60):
+        try:
+            f_u = plant.f_u(y, u, t)
+            move = -np.linalg.solve(f_u, f[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            raise ValueError(f"{plant!r} cannot be held still: f_u is singular") from None
+        length = np.ones_like(size)
+        for _ in range(30):
+            ahead = np.asarray(plant.f(y, u + length[..., None] * move, t), dtype=float)
+            worse = ~(np.linalg.norm(ahead, axis=-1) < size) & (size > 0)
+            if not worse.any():
+                break
+            length = np.where(worse, length / 2, length)
+        step = np.where((length > 1e-8)[..., None], length[..., None] * move, 0.0)
+        u = u + step
+        f = np.asarray(plant.f(y, u, t), dtype=float)
+        size = np.linalg.norm(f, axis=-1)
+        if (np.abs(step) <= 1e-14 * np.abs(u)).all():
+            break
+    rounding = 1e-13 * np.linalg.norm(f_u, axis=(-2, -1)) * np.linalg.norm(u, axis=-1)
+    bad = ~(size <= 1e-9 * scale + rounding)
+    if bad.any():
+        where = np.array2string(y[bad][0], precision=4)
+        raise ValueError(f"{plant!r} cannot be held still at y = {where}: no u makes f(y, u) zero")
+    return u
+
+
+def transforms_of(plant: Any, transforms: AuxiliarySpace | Transforms | None = None) -> Transforms:
+    """The auxiliary space as a function of y: given, fixed, or by `decompose` at equilibrium."""
+    if callable(transforms):
+        return transforms
+
+    def at(y: Array, u: Array) -> AuxiliarySpace:
+        f_y, f_u = plant.f_y(y, u), plant.f_u(y, u)
+        if transforms is None:
+            return decompose(f_y, f_u)
+        return AuxiliarySpace.from_transforms(transforms.T_y, transforms.T_a, f_y, f_u)
+
+    if plant.constant:
+        space = at(np.zeros(plant.n), np.zeros(plant.n))
+        return lambda y: space
+    return lambda y: at(y, equilibrium(plant, y))
+
+
+def action_of(policy: Any, n: int) -> Action:
+    """A policy as a function from s = (z, int z), (..., n, 2), and diag(R), (..., n), to a.
+
+    Signed slopes (n, 2) and a function of s give a as they are. Everything else (an object with
+    `pi(s)`, a network, `ModularPolicy`, the policy of `cmc.sb3`) obeys a_i = -sign(R_ii) pi_i
+    (`constraint_sign`), with the R that it was told, if it was.
+
+    Raises:
+        TypeError: If it cannot be evaluated.
+    """
+    policy = getattr(policy, "actor", policy)
+    if not callable(policy) and not hasattr(policy, "pi"):
+        slopes = checked("policy", policy, "... n 2", n=n)
+        return lambda s, gains: (slopes * s).sum(axis=-1)
+    if hasattr(policy, "part"):
+        name = type(policy).__name__
+        raise TypeError(f"{name} sees a part of an observation, not (z, int z): pass a function")
+    if not hasattr(policy, "pi") and not hasattr(policy, "parameters"):
+        return lambda s, gains: np.asarray(policy(s), dtype=float)
+    pi = policy.pi if hasattr(policy, "pi") else _in_double(getattr(policy, "network", policy))
+    told = None if "R" in getattr(policy, "layout", {}) else getattr(policy, "R", None)
+    told = None if told is None else np.asarray(told, dtype=float)
+    seen = np.array([1.0, 1.0 if getattr(policy, "integral", True) else 0.0])
+    normalise = bool(getattr(policy, "normalise", False))
+
+    def action(s: Array, gains: Array) -> Array:
+        R = gains if told is None else told
+        return np.asarray(-(1 / R if normalise else np.sign(R)) * pi(s * seen))  # constraint_sign
+
+    return action
+
+
+def _in_double(network: Any) -> Callable[[Array], Array]:
+    network = copy.deepcopy(network).double()
+    like = next(network.parameters())
+    return lambda s: np.asarray(network(like.new_tensor(s)).detach().numpy())
+
+
+def closed_loop(
+    plant: Any,
+    policy: Any,
+    y0: ArrayLike,
+    t: ArrayLike,
+    *,
+    transforms: AuxiliarySpace | Transforms | None = None,
+    y_ref: ArrayLike | Callable[[float], ArrayLike] = 0.0,
+    h: float | None = None,
+    integral: ArrayLike = 0.0,
+    u0: ArrayLike = 0.0,
+    clip: bool = False,
+) -> Path:
+    """Simulate the loop of the module's first lines.
+
+    Args:
+        plant: Has `n`, `f`, `f_y`, `f_u`, `constant`.
+        policy: Signed slopes (n, 2), a function from s (..., n, 2) to a, or any policy with
+            the sign rule: see `action_of`.
+        y0: Starts, (..., n); a network with seeds needs their axis in front.
+        t: Increasing times, s, (time,).
+        transforms: The auxiliary space, fixed or as a function of y; by default `decompose`, at
+            each state where the plant's Jacobians vary.
+        y_ref: Where y is to go, (..., n), or a function of time.
+        h: Sample time, s: the command is held and I_k = I_{k-1} + h z_k. Continuous without it.
+        integral: I at the start, broadcast to y0.
+        u0: Command to which T_a a (and the policy's own `u0`) is added.
+        clip: Whether the plant's limits `u_low`, `u_high` act.
+    """
+    loop = Loop(plant, policy, transforms, y_ref, u0, clip)
+    y = checked("y0", y0, "... n", n=plant.n)
+    I, times = np.broadcast_to(checked("integral", integral), y.shape), checked("t", t, "time")
+    start = np.concatenate([y, I], axis=-1)
+    if h is None:
+        s = flow(loop.field, start, times)
+        rows = [loop.signals(*_halves(x), float(now)) for x, now in zip(s, times, strict=True)]
+        z, u = (np.stack(part) for part in zip(*rows, strict=True))
+        return Path(times, _halves(s)[0], z, _halves(s)[1], u)
+    return _held(loop, start, times, number("h", h, above=0.0))
+
+
+def _halves(s: Array) -> tuple[Array, Array]:
+    n = s.shape[-1] // 2
+    return s[..., :n], s[..., n:]
+
+
+def _held(loop: Loop, start: Array, times: Array, h: float) -> Path:
+    """Samples at times[0] + k h; `times` may fall anywhere between them."""
+    y, I = _halves(start)
+    ys, zs, Is, us = np.empty((4, len(times), *y.shape))
+    now, k, tiny = float(times[0]), 0, 1e-9 * h
+    for i, end in enumerate(times):
+        while True:
+            if now >= times[0] + k * h - tiny:  # measure, integrate, hold
+                z = loop.signals(y, I, now)[0]
+                I, k = I + h * z, k + 1
+                u = loop.signals(y, I, now, z)[1]
+            if now >= end - tiny:
+                break
+            until = float(min(times[0] + k * h, end))
+            y, now = loop.hold(y, u, now, until), until
+        ys[i], zs[i], Is[i], us[i] = y, loop.signals(y, I, now)[0], I, u
+    return Path(times, ys, zs, Is, us)
+
+
+class Loop:
+    """A plant under a policy, ready to be integrated; arguments as in `closed_loop`."""
+
+    def __init__(
+        self,
+        plant: Any,
+        policy: Any,
+        transforms: AuxiliarySpace | Transforms | None = None,
+        y_ref: ArrayLike | Callable[[float], ArrayLike] = 0.0,
+        u0: ArrayLike = 0.0,
+        clip: bool = False,
+    ) -> None:
+        self.plant, self.n, self.clip = plant, plant.n, clip
+        self.action = action_of(policy, plant.n)
+        own = np.asarray(getattr(getattr(policy, "actor", policy), "u0", 0.0), dtype=float)
+        self.u0 = checked("u0", u0) + own
+        self.spaces = transforms_of(plant, transforms)
+        self.goal = y_ref if callable(y_ref) else None
+        self.y_ref = np.zeros(()) if callable(y_ref) else checked("y_ref", y_ref)
+
+    def signals(
+        self, y: Array, I: Array, t: float = 0.0, z: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Auxiliary signal z and command u, (..., n) each."""
+        space = self.spaces(y)
+        if z is None:
+            goal = self.y_ref if self.goal is None else checked("y_ref", self.goal(t))
+            z = space.to_z(y - goal)
+        u = self.u0 + space.to_u(self.action(np.stack([z, I], axis=-1), space.gains))
+        return z, np.clip(u, self.plant.u_low, self.plant.u_high) if self.clip else u
+
+    def field(self, t: float, s: Array) -> Array:
+        """Right-hand side in (y, int z), (..., 2n)."""
+        y, I = _halves(s)
+        z, u = self.signals(y, I, t)
+        return np.concatenate([self.plant.f(y, u, t), z], axis=-1)
+
+    def step(self, s: Array, h: float, t: float = 0.0) -> Array:
+        """One sample of length h in (y_k, I_{k-1}), (..., 2n)."""
+        y, I = _halves(s)
+        z = self.signals(y, I, t)[0]
+        I = I + h * z
+        return np.concatenate([self.hold(y, self.signals(y, I, t, z)[1], t, t + h), I], axis=-1)
+
+    def hold(self, y: Array, u: Array, t: float, until: float) -> Array:
+        """The plant from `t` to `until` under a held command: exact where it is linear."""
+        plant, h = self.plant, until - t
+        if not plant.constant:
+            return flow(lambda at, x: plant.f(x, u, at), y, [t, until])[-1]
+        # y' = A (y - y_t) + f(y_t, u) from rest at y_t: h phi_1(A h) f
+        A, n = plant.f_y(np.zeros(self.n), np.zeros(self.n)), self.n
+        block = np.zeros((2 * n, 2 * n))
+        block[:n, :n], block[:n, n:] = A * h, h * np.eye(n)
+        return np.asarray(y + plant.f(y, u, t) @ expm(block)[:n, n:].T)
