@@ -1,18 +1,20 @@
 """Assets, checkpoints and results on disk, without pickle and without half-written files.
 
 A checkpoint is one safetensors file whose header carries a JSON record (study, method,
-configuration, seeds, versions, command, commit). A result is one JSON file with the same record.
-Every file is written to a temporary name, flushed, and renamed.
+configuration, seeds, versions, command, commit) and a digest of all that is in the file. Every file
+is written to a temporary name, flushed, and renamed.
 """
 
 from __future__ import annotations
 
+import glob
+import hashlib
 import json
 import os
 import platform
+import secrets
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Mapping
 from importlib import metadata
 from pathlib import Path
@@ -21,6 +23,8 @@ from typing import IO, Any
 import numpy as np
 
 _FORMAT = "cmc-checkpoint-1"
+_HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+"""This machine, in names of temporary files."""
 
 
 class CheckpointError(ValueError):
@@ -44,22 +48,43 @@ def write_atomic(path: str | Path, write: Callable[[IO[bytes]], Any]) -> Path:
     """Write a file through a temporary name in the same folder, then rename it.
 
     If writing fails (a full disk, an interrupt), the earlier file is untouched and the temporary
-    one is removed.
+    one is removed; what a killed process left is removed by the next one that writes the file.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
+    _remove_left_over(path)
+    temporary = path.with_name(f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with temporary.open("xb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)  # mkstemp makes private files; assets are shared
         os.replace(temporary, path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
     return path
+
+
+def _remove_left_over(path: Path) -> None:
+    """Remove temporary files of this machine's processes that are no more."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.{_HOST}-*.tmp"):
+        pid = left.name.removeprefix(f".{path.name}.{_HOST}-").split("-")[0]
+        if pid.isdigit() and not alive(int(pid)):
+            left.unlink(missing_ok=True)
+
+
+def alive(pid: int) -> bool:
+    """Whether a process of this machine is there; always true where that cannot be asked."""
+    if os.name != "posix":
+        return True
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def write_json(path: str | Path, content: Mapping[str, Any]) -> Path:
@@ -137,10 +162,10 @@ def save_checkpoint(
     if missing:
         raise ValueError(f"the checkpoint record lacks {sorted(missing)}")
     arrays = {name: np.ascontiguousarray(array) for name, array in tensors.items()}
-    for name, array in arrays.items():
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise ValueError(f"tensor {name!r} is not finite: nothing was written to {path}")
-    header = {"format": _FORMAT, "record": json.dumps(dict(record), allow_nan=False)}
+    if broken := _not_finite(arrays):
+        raise ValueError(f"tensor {broken!r} is not finite: nothing was written to {path}")
+    text = json.dumps(dict(record), allow_nan=False)
+    header = {"format": _FORMAT, "record": text, "digest": _digest(arrays, text)}
     data = save(arrays, metadata=header)
     return write_atomic(path, lambda file: file.write(data))
 
@@ -159,7 +184,7 @@ def load_checkpoint(
         The arrays by name, and the record.
 
     Raises:
-        CheckpointError: if it is missing, truncated, pickled, foreign or of another study/method.
+        CheckpointError: if it is missing, damaged, pickled, foreign or of another study/method.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -170,7 +195,7 @@ def load_checkpoint(
         with safe_open(path, framework="np") as file:
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except SafetensorError as error:
+    except (SafetensorError, OSError, TypeError, ValueError, KeyError) as error:
         raise CheckpointError(
             f"{path} is not a complete safetensors file ({error}); "
             "truncated, pickled and foreign files are refused"
@@ -179,10 +204,37 @@ def load_checkpoint(
         raise CheckpointError(
             f"{path}: wanted a file of format {_FORMAT!r}, found {header.get('format')!r}"
         )
-    record = json.loads(header["record"])
+    text = header.get("record", "")
+    # files of earlier versions carry no digest
+    if header.get("digest", "") not in ("", _digest(tensors, text)):
+        raise CheckpointError(f"{path} is damaged: its content is not what was written")
+    if broken := _not_finite(tensors):
+        raise CheckpointError(f"{path} is damaged: tensor {broken!r} is not finite")
+    try:
+        record = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise CheckpointError(f"{path} is damaged: its record is not JSON: {error}") from error
+    if not (isinstance(record, dict) and {"study", "method"} <= set(record)):
+        raise CheckpointError(f"{path}: wanted a record of study and method, found {text[:80]!r}")
     for key, wanted in (("study", study), ("method", method)):
-        if wanted is not None and record.get(key) != wanted:
+        if wanted is not None and record[key] != wanted:
             raise CheckpointError(
-                f"{path}: wanted a checkpoint of {key} {wanted!r}, found {record.get(key)!r}"
+                f"{path}: wanted a checkpoint of {key} {wanted!r}, found {record[key]!r}"
             )
     return tensors, record
+
+
+def _not_finite(arrays: Mapping[str, np.ndarray]) -> str | None:
+    """Name of the first array that holds NaN or infinity, if there is one."""
+    floats = ((name, a) for name, a in arrays.items() if a.dtype.kind == "f")
+    return next((name for name, a in floats if not np.isfinite(a).all()), None)
+
+
+def _digest(arrays: Mapping[str, np.ndarray], record: str) -> str:
+    """SHA-256 of names, types, shapes and contents of the arrays, and of the record."""
+    found = hashlib.sha256(record.encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        found.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        found.update(array.tobytes())
+    return found.hexdigest()

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -36,26 +39,86 @@ def test_a_checkpoint_of_something_else_is_refused(tmp_path: Path, key: str, val
         store.load_checkpoint(path, **{key: value})
 
 
-def test_damaged_and_foreign_files_are_refused(tmp_path: Path) -> None:
-    good = store.save_checkpoint(tmp_path / "a.safetensors", TENSORS, RECORD).read_bytes()
+def test_foreign_files_are_refused(tmp_path: Path) -> None:
     from safetensors.numpy import save
 
-    bad = {
-        "truncated": good[: len(good) // 2],
-        "empty": b"",
-        "pickled": pickle.dumps(TENSORS),
-        "text": b"not a checkpoint at all, only words",
-    }
+    bad = {"empty": b"", "pickled": pickle.dumps(TENSORS), "text": b"only words, no checkpoint"}
     for name, data in bad.items():
-        path = tmp_path / name
-        path.write_bytes(data)
+        (tmp_path / name).write_bytes(data)
         with pytest.raises(store.CheckpointError, match="not a complete safetensors file"):
-            store.load_checkpoint(path)
+            store.load_checkpoint(tmp_path / name)
     (tmp_path / "foreign").write_bytes(save(TENSORS))
     with pytest.raises(store.CheckpointError, match="wanted a file of format"):
         store.load_checkpoint(tmp_path / "foreign")
     with pytest.raises(store.CheckpointError, match="no checkpoint at"):
         store.load_checkpoint(tmp_path / "missing")
+
+
+@pytest.mark.parametrize("record", ["", "[1]", "{", '"x"', '{"study": "peg_touch"}'])
+def test_a_record_that_is_none_is_refused(tmp_path: Path, record: str) -> None:
+    from safetensors.numpy import save
+
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(save(TENSORS, metadata={"format": "cmc-checkpoint-1", "record": record}))
+    with pytest.raises(store.CheckpointError, match=r"a\.safetensors"):
+        store.load_checkpoint(path)
+
+
+def test_every_single_damage_is_a_checkpoint_error(tmp_path: Path) -> None:
+    path = store.save_checkpoint(tmp_path / "a.safetensors", TENSORS, RECORD)
+    good = path.read_bytes()
+    for k in range(len(good)):  # a flipped bit anywhere, and an end anywhere
+        flipped = bytearray(good)
+        flipped[k] ^= 1 << k % 8
+        for data in (bytes(flipped), good[:k]):
+            path.write_bytes(data)
+            try:
+                tensors, record = store.load_checkpoint(path)
+            except store.CheckpointError:
+                continue
+            assert record == RECORD  # what is read is what was written, if it is read at all
+            for name, array in TENSORS.items():
+                np.testing.assert_array_equal(tensors[name], array)
+
+
+def test_files_without_a_digest_are_read_and_must_be_finite(tmp_path: Path) -> None:
+    from safetensors.numpy import save
+
+    path, header = tmp_path / "a", {"format": "cmc-checkpoint-1", "record": json.dumps(RECORD)}
+    path.write_bytes(save(TENSORS, metadata=header))
+    assert store.load_checkpoint(path)[1] == RECORD
+    path.write_bytes(save({"w": np.array([1.0, np.inf])}, metadata=header))
+    with pytest.raises(store.CheckpointError, match="'w' is not finite"):
+        store.load_checkpoint(path)
+
+
+def test_files_are_as_open_as_the_umask_says(tmp_path: Path) -> None:
+    for mask, wanted in ((0o077, 0o600), (0o022, 0o644)):
+        before = os.umask(mask)
+        try:
+            path = store.write_json(tmp_path / "a.json", {})
+        finally:
+            os.umask(before)
+        assert path.stat().st_mode & 0o777 == wanted
+
+
+def test_what_a_killed_process_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    code = (
+        "import os, sys; from cmc import store\n"
+        "store.write_atomic(sys.argv[1], lambda file: (file.write(b'half'), file.flush(), "
+        "os.kill(os.getpid(), 9)))"
+    )
+    path = tmp_path / "a.json"
+    subprocess.run([sys.executable, "-c", code, path], check=False)
+    assert len(list(tmp_path.iterdir())) == 1  # the half-written one
+    store.write_json(path, {})
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_writer_at_work_keeps_its_temporary_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    store.write_atomic(path, lambda file: store.write_json(path, {"inner": 1}) and file.write(b"2"))
+    assert path.read_bytes() == b"2"
 
 
 def test_arrays_that_are_not_finite_are_not_written(tmp_path: Path) -> None:
