@@ -100,17 +100,25 @@ def load_scene(
         SceneError: if the file is missing, does not parse, or holds no peg.
         ValueError: if `timestep` is not in (0, 5 ms]: contact needs two steps in 10 ms.
     """
-    if not 0 < timestep <= 0.005:
-        raise ValueError(f"the physics step must be in (0, 0.005] s, got {timestep}")
-    spec = _read(scene)
-    _fit(spec, peg or Peg(), scene)
-    spec.option.timestep = timestep
+    spec = scene_spec(scene, peg, timestep)
     for sensor in spec.sensors:
         sensor.nsample = history
     try:
         return spec.compile()
     except ValueError as error:
         raise SceneError(f"scene {scene} does not compile: {error}") from error
+
+
+def scene_spec(
+    scene: str | Path = "panda.xml", peg: Peg | None = None, timestep: float = 0.002
+) -> mujoco.MjSpec:
+    """The same scene before it is compiled, for what needs its MJCF text; see `load_scene`."""
+    if not 0 < timestep <= 0.005:
+        raise ValueError(f"the physics step must be in (0, 0.005] s, got {timestep}")
+    spec = _read(scene)
+    _fit(spec, peg or Peg(), scene)
+    spec.option.timestep = timestep
+    return spec
 
 
 def _read(scene: str | Path) -> mujoco.MjSpec:

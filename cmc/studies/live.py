@@ -1,0 +1,109 @@
+"""What a live page needs of a peg study: the task, test starts, and policies as numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from torch import Tensor, nn
+
+from cmc.robot.panda import scene_spec
+from cmc.studies.two_level import TwoLevelStudy, start_joints
+from cmc.studies.two_level_evaluation import TEST_SEED
+from cmc.studies.two_level_training import load, marks
+
+
+def live_task(study: TwoLevelStudy, starts: int = 5) -> dict[str, Any]:
+    """Scene, control law, limits and test starts of a study's task; SI units throughout."""
+    c, latent = study.task, study.task.gains.latent
+    spec = scene_spec(c.scene, c.peg, c.timestep)
+    spec.compile()
+    task = study.task_class(c, num=starts)
+    task.seed([TEST_SEED + k for k in range(starts)])
+    obs = task.reset()
+    goals, planning = obs[:, task.layout["goal"]], study.planning()
+    sizes = {name: part.stop - part.start for name, part in task.layout.items()}
+
+    def row(table: Any, name: str, default: float) -> list[float]:
+        return np.broadcast_to(table.get(name, default), (sizes[name],)).astype(float).tolist()
+
+    law = c.law
+    return {
+        "xml": spec.to_xml(),
+        "substeps": round(c.tick / c.timestep),
+        "compliant": c.peg.stiffness > 0,
+        "K_p": latent.K_p.tolist(),
+        "K_d": latent.K_d.tolist(),
+        "K1": latent.K1.tolist(),
+        "K2": latent.K2.tolist(),
+        "integrates": [1.0] * 3 + [0.0] * 3,
+        **{name: getattr(law, name) for name in ("form", "split", "error_limit", "pivot_floor")},
+        **{name: getattr(law, name) for name in ("posture_stiffness", "posture_damping")},
+        "posture": start_joints(c).tolist(),
+        **{name: getattr(c, name) for name in ("tick", "horizon", "ticks", "increments")},
+        **{name: getattr(c, name) for name in ("tilt_limit", "u_limit")},
+        **{f"subgoal_{end}": getattr(c, f"subgoal_{end}") for end in ("low", "high")},
+        **{f"workspace_{end}": getattr(c, f"workspace_{end}") for end in ("low", "high")},
+        "planning": [
+            {
+                "name": name,
+                "shift": row(planning.shift, name, 0.0),
+                "scale": row(planning.scale, name, 1.0),
+            }
+            for name in planning.fields or task.high_level
+        ],
+        "starts": [
+            {"qpos": task.worlds.qpos[k].tolist(), "goal": goals[k].tolist()} for k in range(starts)
+        ],
+    }
+
+
+def live_policies(
+    study: TwoLevelStudy, methods: Sequence[str], steps: Sequence[int] | None = None
+) -> list[dict[str, Any]]:
+    """Planner and low level of every method, kept policy and seed, as nested lists of arrays.
+
+    Args:
+        study: configuration.
+        methods: names; those with a low level of the tip, or none.
+        steps: which kept policies; the last one of each method if None.
+    """
+    found = []
+    for name in methods:
+        kept = []
+        for step in [m for m in marks(study, name) if steps is None or m in steps][-3:]:
+            planner, low, record = load(study, name, step)
+            seeds = record["seeds"]
+            actor = getattr(low, "actor", None)
+            policies = [
+                {"planner": _layers(planner.net, k, 1)[0], "low": _low(actor, k)}
+                for k in range(len(seeds))
+            ]
+            kept.append({"step": step, "seeds": list(seeds), "policies": policies})
+        if steps is None:
+            kept = kept[-1:]
+        found.append({"name": name, "title": study.method(name).title, "kept": kept})
+    return found
+
+
+def _low(actor: nn.Module | None, seed: int) -> dict[str, Any]:
+    if actor is None:
+        return {"kind": "none"}
+    net: Any = actor.net
+    if not hasattr(net, "mlp"):
+        return {"kind": "gain", "gain": net.gain.detach().numpy()}
+    weights = net.positive_weights() if hasattr(net, "positive_weights") else None
+    return {"kind": "networks", "networks": _layers(net.mlp, seed, net.n, weights)}
+
+
+def _layers(
+    mlp: Any, seed: int, copies: int, weights: Sequence[Tensor] | None = None
+) -> list[list[dict[str, Any]]]:
+    """The networks of one seed in a stack: for each copy, layers with w (in, out) and b (out,)."""
+    used = [w.detach().numpy() for w in (mlp.weights if weights is None else weights)]
+    shift = [b.detach().numpy() for b in mlp.biases] or [None] * len(used)
+    return [
+        [{"w": w[k], "b": None if b is None else b[k, 0]} for w, b in zip(used, shift, strict=True)]
+        for k in range(seed * copies, (seed + 1) * copies)
+    ]
