@@ -29,6 +29,7 @@ const arms = PAGE.arms.map((choice, index) => {
   arm.selects = arm.box.querySelectorAll("select");
   return arm;
 });
+live.traces = arms.map((arm) => arm.trace);
 function fill(select, options, chosen) {
   select.replaceChildren(...options.map((text, k) => new Option(text, k, false, k === chosen)));
 }
@@ -166,7 +167,7 @@ const hear = {
     states.forEach((state, k) => {
       const error = Math.hypot(...state.tip.map((x, i) => x - state.target[i]));
       arms[k].trace.push([state.time, 1e3 * error]);
-      if (arms[k].trace.length > 1 && state.time < arms[k].trace.at(-2)[0]) arms[k].trace = [];
+      if (arms[k].trace.length > 1 && state.time < arms[k].trace.at(-2)[0]) arms[k].trace.length = 0;
       while (arms[k].trace.length && state.time - arms[k].trace[0][0] > 10) arms[k].trace.shift();
     });
   },

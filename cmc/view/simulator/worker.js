@@ -12,7 +12,7 @@ function serve(port, load) {
     let debt = Math.min(now - clock, 0.2);  // a page that slept does not race afterwards
     if (!running || debt < task.tick) return;
     for (; debt >= task.tick; debt -= task.tick) {
-      if (now > pushEnds) { arms.forEach(({ world }) => world.push([0, 0, 0])); pushEnds = Infinity; }
+      if (arms[0].world.tick >= pushEnds) { arms.forEach(({ world }) => world.push([0, 0, 0])); pushEnds = Infinity; }
       for (const arm of arms) arm.world.follow(arm.policy, planning);
     }
     clock = now - debt;
@@ -41,7 +41,7 @@ function serve(port, load) {
     target({ position }) { for (const { world } of arms) world.setTarget(position); report(); },
     push({ force, seconds }) {
       for (const { world } of arms) world.push(force);
-      pushEnds = performance.now() / 1000 + (seconds ?? Infinity);
+      pushEnds = arms[0].world.tick + (seconds ?? Infinity) / task.tick;
     },
     restart({ start }) { restart(start); },
     // A whole test episode at once, as fast as it goes: the rows of joint positions.
