@@ -1,4 +1,4 @@
-"""Two levels: the planner's exploration."""
+"""Two levels: the planner's exploration, its rates, and what its critics see."""
 
 from __future__ import annotations
 
@@ -9,32 +9,96 @@ import pytest
 import torch
 
 from cmc.learning.hierarchy import HierarchyConfig
-from cmc.studies import peg_push
+from cmc.studies import peg_maze, peg_push
 from cmc.studies.two_level_parts import build
 
 
-def test_noise_falls_linearly_and_stays():
-    config = HierarchyConfig(high_noise=0.4, high_noise_end=0.1, noise_steps=1000)
-    noise = np.array([config.noise(k) for k in range(0, 2001, 100)])
-    np.testing.assert_allclose(np.diff(noise[:11]), -0.03)
-    np.testing.assert_allclose(noise[10:], 0.1)
-    assert HierarchyConfig(high_noise=0.4).noise(10**6) == 0.4
+def test_exploration_falls_linearly_and_stays():
+    config = HierarchyConfig(
+        high_noise=0.4, high_noise_end=0.1, redraw=(0.2, 0.1), burst=(0.1, 0.0), noise_steps=1000
+    )
+    found = np.array([config.exploration(k) for k in range(0, 2001, 100)])
+    np.testing.assert_allclose(np.diff(found[:11], axis=0) - [-0.03, -0.01, -0.01], 0, atol=1e-12)
+    np.testing.assert_allclose(found[10:] - [0.1, 0.1, 0.0], 0, atol=1e-12)
+    assert HierarchyConfig(high_noise=0.4).exploration(10**6) == (0.4, 0.0, 0.0)
+
+
+def test_rates_fall_to_a_tenth_between_two_steps():
+    config = HierarchyConfig(rate_steps=(100, 300))
+    assert [config.rate(k) for k in (0, 100, 200, 300, 400)] == pytest.approx(
+        [1, 1, 0.55, 0.1, 0.1]
+    )
+
+
+def test_the_low_level_learns_from_the_start_and_the_planner_after_the_warm_up():
+    config = HierarchyConfig(
+        samples=10, high_updates=5, low_updates=4, low_updates_late=1, low_late=200, warm_up=100
+    )
+    assert config.updates(100) == (0, 40)
+    assert config.updates(200) == (50, 80)
+    assert config.updates(300) == (100, 90)
+
+
+def planner(study, worlds=400):
+    """A training whose planner asks for the middle of its range, and what it sees."""
+    study = replace(study, hierarchy=replace(study.hierarchy, worlds=worlds))
+    trainer = build(study, "frozen", [0])
+    for parameter in trainer.planner.actor.parameters():
+        torch.nn.init.zeros_(parameter)
+    return trainer, study.planning().observe(trainer.task, trainer.task.reset())[None]
 
 
 @pytest.mark.parametrize("steps", [10_000, 500_000])
 def test_sub_goals_scatter_by_the_noise_of_the_moment(steps):
-    study = replace(peg_push.STUDY, hierarchy=replace(peg_push.STUDY.hierarchy, worlds=400))
-    trainer = build(study, "frozen", [0])
-    for parameter in trainer.planner.actor.parameters():
-        torch.nn.init.zeros_(parameter)  # sub-goals at 0, far from the ends of their range
+    calm = replace(peg_push.STUDY.hierarchy, redraw=(0.0, 0.0), burst=(0.0, 0.0))
+    trainer, seen = planner(replace(peg_push.STUDY, hierarchy=calm))
     trainer.steps = steps
-    seen = study.planning().observe(trainer.task, trainer.task.reset())[None]
     action = trainer._choose(seen, np.zeros(()))
-    wanted = study.hierarchy.noise(steps)
-    assert np.std(action) == pytest.approx(wanted, rel=0.1)
+    assert np.std(action) == pytest.approx(calm.exploration(steps)[0], rel=0.1)
 
 
-@pytest.mark.parametrize("wrong", [{"high_noise": -0.1}, {"noise_steps": 0}])
-def test_impossible_noise_is_refused(wrong):
-    with pytest.raises(ValueError, match="noise"):
+def test_redraws_and_bursts_come_as_often_as_asked_and_bursts_last():
+    rates = replace(
+        peg_push.STUDY.hierarchy,
+        high_noise=0.0,
+        high_noise_end=0.0,
+        redraw=(0.1, 0.1),
+        burst=(0.05, 0.05),
+    )
+    trainer, seen = planner(replace(peg_push.STUDY, hierarchy=rates))
+    trainer.steps = 10_000
+    drawn = np.array([trainer._choose(seen, np.zeros(()))[0] != 0 for _ in range(60)])
+    whole = drawn.all(-1)  # (60, worlds): in a burst, or by six redraws of one in ten
+    share = 3 * 0.05 / (1 + 2 * 0.05)  # three segments each; none begins within another
+    assert whole[3:].mean() == pytest.approx(share, rel=0.15)
+    assert drawn[~whole].mean() == pytest.approx(0.1, rel=0.1)
+    begins = np.argwhere(whole[1:-2] & ~whole[:-3])
+    for k, world in begins:
+        assert whole[k + 1 : k + 4, world].all()
+
+
+@pytest.mark.parametrize("study", [peg_push.STUDY, peg_maze.STUDY], ids=lambda s: s.name)
+def test_critics_see_tip_and_sub_goal_from_the_goal(study):
+    study = replace(study, relative=True)
+    trainer, _ = planner(study, worlds=3)
+    task, planning = trainer.task, study.planning()
+    action = np.random.default_rng(0).uniform(-0.3, 0.3, (3, len(planning.low)))
+    obs = task.reset()
+    seen = torch.as_tensor(planning.observe(task, obs), dtype=torch.float32)
+    view = trainer.planner._view(seen, torch.as_tensor(action, dtype=torch.float32)).numpy()
+    features = view[:, seen.shape[1] + action.shape[1] :]
+    tip, goal = (task.select(obs, (name,)) for name in ("position", "goal"))
+    task.set_subgoal(planning.subgoal(action))  # well inside the workspace: not clamped
+    np.testing.assert_allclose(5 * features[:, :3], 1e3 * (task.target - goal), atol=2e-2)
+    np.testing.assert_allclose(features[:, 9:12], np.tanh(1e3 * (tip - goal)), atol=2e-2)
+    length = np.linalg.norm(1e3 * (task.target - goal), axis=-1)
+    np.testing.assert_allclose(5 * features[:, 15], np.hypot(length, 0.1), atol=2e-2)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"high_noise": -0.1}, {"noise_steps": 0}, {"redraw": (1.1, 0.0)}, {"rate_steps": (5, 5)}],
+)
+def test_impossible_settings_are_refused(wrong):
+    with pytest.raises(ValueError, match="noise|redraw|rate_steps"):
         HierarchyConfig(**wrong)

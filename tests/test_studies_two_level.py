@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,13 @@ from scipy.stats import binom
 
 from cmc import store
 from cmc.learning.hierarchy import HierarchyConfig
-from cmc.studies import peg_maze, peg_push, two_level, two_level_evaluation, two_level_results
+from cmc.studies import (
+    peg_maze,
+    peg_push,
+    two_level,
+    two_level_evaluation,
+    two_level_results,
+)
 from cmc.studies.two_level_training import load, marks, train
 
 SMALL = HierarchyConfig(worlds=2, samples=80, high_updates=4, low_updates=4, warm_up=80)
@@ -77,10 +85,41 @@ def test_a_run_that_was_stopped_ends_with_the_same_weights(tmp_path: Path) -> No
             np.testing.assert_array_equal(value, expected[key], err_msg=f"{name} {key}")
 
 
+@pytest.mark.parametrize("study", [peg_maze.STUDY, peg_push.STUDY], ids=lambda s: s.name)
+@pytest.mark.parametrize("how", ["in the callback", signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_is_saved_within_an_episode(study, how, tmp_path: Path) -> None:
+    study, steps = small(study), 360
+    whole = train(study, "ctd3", [1, 2], steps=steps, out=tmp_path / "whole")
+
+    def stop(row: dict[str, Any]) -> None:
+        if row["steps"] == 160:  # the second of three segments
+            if isinstance(how, str):
+                raise KeyboardInterrupt
+            os.kill(os.getpid(), how)
+
+    with pytest.raises(KeyboardInterrupt):
+        train(study, "ctd3", [1, 2], steps=steps, out=tmp_path / "parts", callback=stop)
+    rows: list[int] = []
+    parts = train(
+        study,
+        "ctd3",
+        [1, 2],
+        steps=steps,
+        out=tmp_path / "parts",
+        callback=lambda row: rows.append(row["steps"]),
+    )
+    assert rows[0] == 200
+    expected = weights(whole)
+    for key, value in weights(parts).items():
+        np.testing.assert_array_equal(value, expected[key], err_msg=key)
+
+
 def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
     program = (
         "import sys; sys.path.insert(0, 'tests')\n"
         "from test_studies_two_level import *\n"
+        "import cmc.studies.two_level_training as training\n"
+        "training.SAVE_EVERY = 0.0\n"
         f"train(small(peg_maze.STUDY), 'ctd3', [0], steps=720, out={str(tmp_path / 'killed')!r})"
     )
     root = Path(__file__).resolve().parent.parent

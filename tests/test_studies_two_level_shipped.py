@@ -56,6 +56,7 @@ def test_figures_keep_their_order(study, name):
             assert np.all((slope >= 0) & (slope <= bound * (1 + 1e-3)))
 
 
+@pytest.mark.xfail(reason="the shipped runs are of an earlier scheme", strict=True)
 @pytest.mark.parametrize(("study", "name"), [("peg_maze", "ctd3"), ("peg_push", "ctd3")])
 def test_a_shipped_run_begins_as_the_present_code_does(study, name, tmp_path):
     path = studies.get(study).train(name, [0], steps=320, out=tmp_path)

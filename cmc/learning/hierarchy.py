@@ -37,10 +37,21 @@ class HierarchyConfig:
             are spread evenly over the segments.
         high_updates: planner updates for each round (`tab:para`: 100).
         low_updates: low-level updates for each round.
+        low_updates_late: the same from `low_late` steps on, or None if they stay (our choice).
+        low_late: environment steps of a seed (our choice).
         high_noise: standard deviation of the planner's noise, in half-ranges (our choice).
         high_noise_end: what it falls to, linearly, or None if it stays (our choice).
-        noise_steps: environment steps of a seed until it has fallen (our choice).
-        warm_up: environment steps of a seed with random sub-goals and no learning (our choice).
+        redraw: probability that an entry of a sub-goal is replaced by a uniform draw, at first and
+            once it has fallen (our choice).
+        burst: probability that a world begins `burst_segments` uniform sub-goals in a row, at first
+            and once it has fallen (our choice).
+        burst_segments: length of a burst (our choice).
+        noise_steps: environment steps of a seed until noise, redraws and bursts have fallen (our
+            choice).
+        rate_steps: environment steps of a seed between which the planner's Adam rates fall,
+            linearly, to a tenth, or None if they stay (our choice).
+        warm_up: environment steps of a seed with random sub-goals, from which the low level alone
+            learns (our choice).
         reward_scale: factor on the mean reward of a segment (our choice).
         capacity: segments that the planner remembers (`tab:para`: 65536).
     """
@@ -49,9 +60,15 @@ class HierarchyConfig:
     samples: int = 1024
     high_updates: int = 100
     low_updates: int = 100
+    low_updates_late: int | None = None
+    low_late: int = 60_000
     high_noise: float = 0.3
     high_noise_end: float | None = None
+    redraw: tuple[float, float] = (0.0, 0.0)
+    burst: tuple[float, float] = (0.0, 0.0)
+    burst_segments: int = 3
     noise_steps: int = 500_000
+    rate_steps: tuple[int, int] | None = None
     warm_up: int = 10_000
     reward_scale: float = 1.0
     capacity: int = 65536
@@ -65,12 +82,33 @@ class HierarchyConfig:
         if min(noise) < 0 or self.noise_steps < 1:
             raise ValueError(f"wanted noise of at least 0 and noise_steps of at least 1: {self}")
 
-    def noise(self, steps: int) -> float:
-        """Standard deviation of the planner's noise after so many steps, in half-ranges."""
-        if self.high_noise_end is None:
-            return self.high_noise
+        if not all(0 <= share <= 1 for share in (*self.redraw, *self.burst)):
+            raise ValueError(f"redraw and burst: wanted probabilities, got {self}")
+        if self.rate_steps is not None and not 0 <= self.rate_steps[0] < self.rate_steps[1]:
+            raise ValueError(f"rate_steps: wanted two rising step counts, got {self.rate_steps}")
+
+    def exploration(self, steps: int) -> tuple[float, float, float]:
+        """Noise in half-ranges, and probabilities of a redraw and of a burst, after `steps`."""
         done = min(steps / self.noise_steps, 1.0)
-        return self.high_noise + done * (self.high_noise_end - self.high_noise)
+        end = self.high_noise if self.high_noise_end is None else self.high_noise_end
+        pairs = ((self.high_noise, end), self.redraw, self.burst)
+        noise, redraw, burst = (first + done * (last - first) for first, last in pairs)
+        return noise, redraw, burst
+
+    def rate(self, steps: int) -> float:
+        """Factor on the planner's Adam rates after `steps`."""
+        if self.rate_steps is None:
+            return 1.0
+        start, end = self.rate_steps
+        return 1.0 - 0.9 * min(max((steps - start) / (end - start), 0.0), 1.0)
+
+    def updates(self, steps: int) -> tuple[int, int]:
+        """Updates of the planner and of the low level that are due after `steps`, in all."""
+        done = max(steps - self.warm_up, 0) / self.samples
+        early = min(steps, self.low_late) / self.samples
+        rest = self.low_updates if self.low_updates_late is None else self.low_updates_late
+        late = steps / self.samples - early
+        return int(done * self.high_updates), int(early * self.low_updates + late * rest)
 
 
 class Relabeller(Protocol):
@@ -126,6 +164,7 @@ class TwoLevel:
         self._generators = [np.random.default_rng([seed, 1, 17]) for seed in seeds]
         task.seed([1_000_003 * seed + k for seed in seeds for k in range(config.worlds)])
         self._obs = task.reset()
+        self._burst = np.zeros(self.shape, dtype=int)  # segments left of a burst
         size = planning.observe(task, self._obs).shape[-1]
         extra = relabeller.size if relabeller else 0
         self.replay = Replay(seeds, size, len(planning.low), config.capacity, 1, extra)
@@ -162,18 +201,25 @@ class TwoLevel:
         if self.steps < self.config.warm_up:
             drawn = np.stack([g.uniform(-1.0, 1.0, count) for g in self._generators])
             return np.clip(middle + drawn, -1.0, 1.0)
-        noise = np.stack([g.standard_normal(count) for g in self._generators])
-        action = evaluate(self.planner.actor, seen) + self.config.noise(self.steps) * noise
+        noise, redraw, burst = self.config.exploration(self.steps)
+        action = evaluate(self.planner.actor, seen)
+        for seed, g in enumerate(self._generators):
+            noisy = action[seed] + noise * g.standard_normal(count)
+            begins = (g.random(count[0]) < burst) & (self._burst[seed] == 0)
+            self._burst[seed, begins] = self.config.burst_segments
+            drawn = (g.random(count) < redraw) | (self._burst[seed] > 0)[:, None]
+            action[seed] = np.where(drawn, g.uniform(-1.0, 1.0, count), noisy)
+        self._burst -= self._burst > 0
         return np.clip(action, -1.0, 1.0)
 
     def _learn(self, before: int) -> None:
         """Updates that fell due between two step counts, both levels."""
-        config, start = self.config, self.config.warm_up
-        rounds = [max(count - start, 0) / config.samples for count in (before, self.steps)]
-        for _ in range(int(rounds[1] * config.high_updates) - int(rounds[0] * config.high_updates)):
+        earlier, due = self.config.updates(before), self.config.updates(self.steps)
+        self.planner.set_rates(self.config.rate(self.steps))
+        for _ in range(due[0] - earlier[0]):
             batch = self.replay.sample(self.planner.config.batch)
             self.planner.update(self.relabeller.relabel(batch) if self.relabeller else batch)
-        for _ in range(int(rounds[1] * config.low_updates) - int(rounds[0] * config.low_updates)):
+        for _ in range(due[1] - earlier[1]):
             self.low.update()
 
     def _split(self, array: Array) -> Array:
@@ -190,6 +236,7 @@ class TwoLevel:
         for name, part in (("planner", planner), ("replay", replay), ("low", low)):
             tensors, state[name] = part
             arrays |= {f"{name}/{key}": value for key, value in tensors.items()}
+        arrays["burst"] = self._burst
         world = self.task.snapshot()
         state["streams"] = world.pop("streams")
         state["noise"] = [g.bit_generator.state for g in self._generators]
@@ -214,6 +261,7 @@ class TwoLevel:
             generator.bit_generator.state = kept
         if self.relabeller:
             self.relabeller.restore(state["relabeller"])
+        self._burst[:] = arrays["burst"]
         self.steps = int(state["steps"])
 
 

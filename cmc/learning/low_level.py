@@ -13,12 +13,12 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from cmc.learning.replay import Replay
 from cmc.learning.td3 import TD3
-from cmc.policies import PositiveNetwork, tanh
+from cmc.policies import IndependentNetwork, PositiveNetwork, tanh
 
 Array = NDArray[np.float64]
 State = tuple[dict[str, np.ndarray], dict[str, Any]]
@@ -81,12 +81,26 @@ class ModularActor(nn.Module):
 
 
 @torch.no_grad()
-def set_gain(net: PositiveNetwork, gain: Array) -> None:
-    """Scale the last layers so that the slope bound in y is `gain` (n,), below any cap."""
-    bound = torch.as_tensor(net.slope_bounds()[1][..., 0])  # (seeds, n)
-    factor = torch.as_tensor(gain) / bound
-    last = net.mlp.weights[-1]
-    last.mul_(factor.reshape(-1, 1, 1).to(last.dtype))
+def set_gain(net: PositiveNetwork | IndependentNetwork, gain: ArrayLike) -> None:
+    """Give every network of a stack the slope `gain`, broadcast to (n,), in y at rest.
+
+    Of positive networks the last layer W is scaled (`gain` must lie below their caps). Free ones
+    start without biases and with slopes of either sign: with h the slope of the last hidden layer,
+    W is changed as little as makes h W = gain.
+    """
+    last = net.mlp.weights[-1]  # (seeds n, hidden, 1)
+    wanted = torch.as_tensor(np.asarray(gain), dtype=last.dtype).expand(net.seeds or 1, net.n)
+    rest = torch.zeros(net.mlp.stack, 1, 2, dtype=last.dtype)
+    positive = isinstance(net, PositiveNetwork)
+    weights = net.positive_weights() if positive else list(net.mlp.weights)
+    slope = net.mlp.slopes(rest, weights)[..., :1]
+    if positive:
+        last.mul_(wanted.reshape(-1, 1, 1) / slope)
+        return
+    h = rest + rest.new_tensor([1.0, 0.0])
+    for weight in weights[:-1]:
+        h = h @ weight
+    last.add_((wanted.reshape(-1, 1, 1) - slope) * h.mT / h.square().sum(-1, keepdim=True))
 
 
 class Fixed:

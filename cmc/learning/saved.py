@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -43,3 +47,26 @@ def saved_training(
     if state["settings"] != plain:
         raise store.CheckpointError(f"{path}: was trained with {state['settings']}")
     return arrays, state
+
+
+@contextmanager
+def interruptions() -> Iterator[Callable[[], bool]]:
+    """Hold SIGINT and SIGTERM back, so that a training stops between two steps, once it is saved.
+
+    Yields:
+        A function that tells whether one came. Outside the main thread signals stay as they are.
+    """
+    came: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(came)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

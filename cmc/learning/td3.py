@@ -9,17 +9,18 @@ gradients are clipped seed by seed.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from cmc.learning.replay import Batch
-from cmc.policies import StackedMLP
+from cmc.policies import StackedMLP, tanh
+
+View = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,8 @@ class TD3Config:
         critic_hidden: hidden sizes of the tanh critics (our choice; the paper's are 400, 300).
         batch: transitions of each seed in one update.
         critic_head_start: critic updates before the actor first moves (our choice: 0).
+        pull: weight of the mean square of the actor's values before its last tanh, which keeps
+            them where tanh still has a slope (our choice: 0).
     """
 
     actor_rate: float = 1e-4
@@ -55,6 +58,7 @@ class TD3Config:
     critic_hidden: tuple[int, ...] = (128, 128)
     batch: int = 128
     critic_head_start: int = 0
+    pull: float = 0.0
 
     def __post_init__(self) -> None:
         positive = (self.actor_rate, self.critic_rate, self.target_period, self.actor_period)
@@ -68,13 +72,14 @@ class TD3:
     """One actor and twin critics for each seed.
 
     Args:
-        actor: maps observations (seeds, batch, size) to actions in [-1, 1] (seeds, batch, action).
+        actor: maps observations (seeds, batch, size) to actions in [-1, 1] (seeds, batch, action);
+            with `pull` it is tanh(actor.net(observation)).
         seeds: one integer for each seed.
-        observation: size of what the critics see.
+        observation: size of an observation.
         action: size of an action.
         config: settings.
         stream: separates learners that share their seeds (two levels, say).
-        scale: what observations are multiplied with before the critics see them, (observation,).
+        view: what the critics see of observations and actions; both as they are if None.
     """
 
     def __init__(
@@ -85,14 +90,15 @@ class TD3:
         action: int,
         config: TD3Config,
         stream: int = 0,
-        scale: ArrayLike = 1.0,
+        view: View | None = None,
     ) -> None:
         self.config, self.seeds = config, tuple(seeds)
         self.actor = actor
-        self._scale = torch.tensor(np.broadcast_to(scale, (observation,)), dtype=torch.float32)
+        self._view = view or (lambda *parts: torch.cat(parts, dim=-1))
+        inputs = self._view(torch.zeros(1, 1, observation), torch.zeros(1, 1, action)).shape[-1]
         own = [seed * 1009 + stream for seed in seeds]
         self.critics = StackedMLP(
-            observation + action, 1, config.critic_hidden, copies=2, seeds=own, start="signed"
+            inputs, 1, config.critic_hidden, copies=2, seeds=own, start="signed"
         )
         self.target_actor = copy.deepcopy(actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
@@ -105,7 +111,7 @@ class TD3:
 
     def values(self, critics: StackedMLP, observation: Tensor, action: Tensor) -> Tensor:
         """Both critics' values, (seeds, 2, batch)."""
-        x = torch.cat([observation * self._scale, action], dim=-1).repeat_interleave(2, dim=0)
+        x = self._view(observation, action).repeat_interleave(2, dim=0)
         return critics(x)[..., 0].reshape(len(self.seeds), 2, -1)
 
     def update(self, batch: Batch) -> dict[str, np.ndarray]:
@@ -142,23 +148,34 @@ class TD3:
         return error.detach().numpy().copy()
 
     def _update_actor(self, batch: Batch) -> None:
-        action = self.actor(batch.observation)
+        config = self.config
+        before = self.actor.net(batch.observation) if config.pull else None
+        action = self.actor(batch.observation) if before is None else tanh(before)
         slope = self._action_gradient(batch.observation, action.detach())
-        clip = self.config.action_gradient_clip
+        clip = config.action_gradient_clip
         if clip is not None:
             slope = slope.clamp(-clip, clip)
+        loss = -(slope * action).sum() / action.shape[1]
+        if before is not None:
+            loss = loss + config.pull * before.square().mean((1, 2)).sum()
         self.actor_adam.zero_grad()
-        (-(slope * action).sum() / action.shape[1]).backward()
+        loss.backward()
         self._clip(self.actor)
         self.actor_adam.step()
 
     def _action_gradient(self, observation: Tensor, action: Tensor) -> Tensor:
         """dQ/da of the first critic alone, (seeds, batch, action)."""
-        x = torch.cat([observation * self._scale, action], dim=-1).requires_grad_()
+        action = action.detach().requires_grad_()
         parts = (self.critics.weights, self.critics.biases)
         weights, biases = ([p.detach()[::2] for p in part] for part in parts)
-        (slope,) = torch.autograd.grad(self.critics.run(x, weights, biases).sum(), x)
-        return slope[..., observation.shape[-1] :]
+        value = self.critics.run(self._view(observation, action), weights, biases)
+        (slope,) = torch.autograd.grad(value.sum(), action)
+        return slope
+
+    def set_rates(self, factor: float) -> None:
+        """Let both optimizers step by `factor` times the configured rates."""
+        self.actor_adam.param_groups[0]["lr"] = factor * self.config.actor_rate
+        self.critic_adam.param_groups[0]["lr"] = factor * self.config.critic_rate
 
     def _smoothing(self, like: Tensor) -> Tensor:
         noise = [generator.standard_normal(like.shape[1:]) for generator in self._generators]

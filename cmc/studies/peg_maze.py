@@ -67,6 +67,7 @@ STIFF_STUDY = replace(
     name="peg_maze_stiff",
     task=STIFF,
     latent=LatentConfig(force_weight=0.5),  # pressing forces exceed the limit here
+    start_gain=20.0,  # the shipped policies of this regime had it
     joint_task=None,
 )
 

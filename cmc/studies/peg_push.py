@@ -20,6 +20,7 @@ from functools import partial
 
 from cmc.envs.peg_push import PUSH, TARGET, PegPush
 from cmc.learning.hierarchy import HierarchyConfig
+from cmc.learning.ppo import PPOConfig
 from cmc.learning.td3 import TD3Config
 from cmc.studies import two_level_motion, two_level_results, two_level_training
 from cmc.studies.two_level import TwoLevelStudy
@@ -36,17 +37,27 @@ STUDY = TwoLevelStudy(
         "sliders": 100.0,
         "slider_velocity": 10.0,
     },
-    hierarchy=HierarchyConfig(high_noise_end=0.05),
+    hierarchy=HierarchyConfig(
+        high_noise_end=0.05,
+        redraw=(0.1, 0.02),
+        burst=(0.05, 0.01),
+        noise_steps=180_000,
+        rate_steps=(180_000, 420_000),
+    ),
     planner=TD3Config(
-        discount=0.5,
+        discount=0.9,
         actor_rate=1e-3,
+        target_rate=0.01,
         target_period=1,
         target_noise=0.05,
         target_noise_clip=0.125,
+        pull=0.003,
     ),
+    ppo=PPOConfig(gamma=0.9, epochs=10, learning_rate=1e-3),
+    relative=True,
     low=TD3Config(discount=1.0, action_gradient_clip=0.1, critic_head_start=500),
-    steps=1_000_000,
-    snapshot_every=100_000,
+    steps=480_000,
+    snapshot_every=60_000,
 )
 
 NAME = STUDY.name

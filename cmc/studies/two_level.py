@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -35,9 +35,11 @@ class Arm:
             relabels the planner's sub-goals.
         positive: positive weights, else free ones.
         capped: no biases, and slopes kept below the sampled-data cap.
-        corrected: the critic sees the full state and learns the segment's return.
+        corrected: the low level's critic sees the full state and learns the segment's return.
         planner: the planner's algorithm.
         noise: exploration of planner and low level, in half-ranges; the defaults if None.
+        changes: fields of the study that the method has otherwise; of a configuration among them
+            only the fields that differ.
         trained: whether it can be trained.
     """
 
@@ -48,14 +50,20 @@ class Arm:
     corrected: bool = False
     planner: Literal["td3", "ppo"] = "td3"
     noise: tuple[float, float] | None = None
+    changes: Mapping[str, Any] = field(default_factory=dict)
     trained: bool = True
 
 
+TUNED = {"start_gain": 20.0}
+"""A gain found by hand, close to the cap: what learning should find by itself."""
 METHODS: dict[str, Arm] = {
     "ctd3": Arm("TD3/C-TD3", "latent"),
+    "ctd3_tuned": Arm("TD3/C-TD3, tuned start", "latent", changes=TUNED),
     "ctd3_paper": Arm("TD3/C-TD3, the paper's scheme", "critic", capped=False),
+    "ctd3_positive": Arm("TD3/C-TD3, corrected critic", "critic", capped=False, corrected=True),
     "frozen": Arm("TD3/frozen random C", "frozen"),
-    "gain": Arm("TD3/hand-tuned gain", "gain"),
+    "frozen_tuned": Arm("TD3/frozen random C, tuned start", "frozen", changes=TUNED),
+    "gain": Arm("TD3/hand-tuned gain", "gain", changes=TUNED),
     "td3": Arm("TD3/TD3, plain critic", "critic", positive=False, capped=False),
     "td3_corrected": Arm(
         "TD3/TD3, corrected critic", "critic", positive=False, capped=False, corrected=True
@@ -82,7 +90,8 @@ class TwoLevelStudy:
         latent: learning through the latent model.
         planner_hidden: hidden sizes (our choice; the paper's are 400, 300).
         low_hidden: hidden sizes for each dimension (our choice; the paper's are 200, 200).
-        start_gain: slope in y that constrained low levels start from, below the cap.
+        start_gain: slope du/dy at rest that every low level with a network starts from.
+        relative: whether the planner's critics also see tip and sub-goal relative to the goal.
         cap: what (K_d + g K2) dt is kept below by construction; chatter starts at 2. Learning
             through the latent model has a lower one of its own.
         mass: effective mass of the tip in x, y, z at the start, kg.
@@ -110,7 +119,8 @@ class TwoLevelStudy:
     latent: LatentConfig = field(default_factory=LatentConfig)
     planner_hidden: tuple[int, ...] = (128, 128)
     low_hidden: tuple[int, ...] = (32, 32)
-    start_gain: float = 20.0
+    start_gain: float = 0.3
+    relative: bool = False
     cap: float = 1.2
     mass: tuple[float, float, float] = (1.75, 3.93, 7.17)
     episodes: int = 100
@@ -139,16 +149,21 @@ class TwoLevelStudy:
         return self.methods[name]
 
     def of(self, name: str) -> TwoLevelStudy:
-        """The study as a method runs it: HIRO has another task, and a planner that sees joints.
+        """The study as a method runs it: with its changes; HIRO has a task and a view of its own.
 
         Raises:
             ValueError: if there is no such method.
         """
-        if self.method(name).low != "hiro" or self.joint_task is None:
-            return self
+        study, arm = self, self.method(name)
+        for key, value in arm.changes.items():
+            old = getattr(study, key)
+            study = replace(study, **{key: replace(old, **value) if is_dataclass(old) else value})
+        if arm.low != "hiro" or self.joint_task is None:
+            return study
         start = tuple(start_joints(self.joint_task))
         return replace(
-            self,
+            study,
+            relative=False,
             task=self.joint_task,
             fields=(*HIGH_LEVEL, "joints"),
             shift={**self.shift, "joints": start},

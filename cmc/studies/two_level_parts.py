@@ -12,12 +12,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from cmc.learning.critic_view import CriticView
 from cmc.learning.hierarchy import HierarchyConfig, TwoLevel
 from cmc.learning.hiro import JointLow, JointUnits, Normalised, OffPolicyCorrection, PullActor
 from cmc.learning.latent_rollout import LatentLow, LatentModel
 from cmc.learning.low_level import CriticLow, Fixed, LowLevel, ModularActor, set_gain
 from cmc.learning.one_level import OneLevelPPO, SegmentEnv
-from cmc.learning.td3 import TD3
+from cmc.learning.td3 import TD3, View
 from cmc.policies import IndependentNetwork, PositiveNetwork, StackedMLP, tanh
 from cmc.robot.panda import LOWER, UPPER
 from cmc.studies.two_level import Arm, TwoLevelStudy, start_joints
@@ -77,7 +78,7 @@ class Gain(nn.Module):
 
 def build_low(study: TwoLevelStudy, name: str, seeds: Sequence[int]) -> LowLevel:
     """The low level of a method, untrained."""
-    arm = study.method(name)
+    arm, study = study.method(name), study.of(name)
     if arm.low == "none":
         return Fixed(None, N)
     if arm.low == "hiro":
@@ -92,18 +93,17 @@ def build_low(study: TwoLevelStudy, name: str, seeds: Sequence[int]) -> LowLevel
         net = PositiveNetwork(
             N, hidden=study.low_hidden, seeds=seeds, bias=not arm.capped, joint_cap=limit
         )
-        if arm.capped:
-            set_gain(net, start)
     else:
         net = IndependentNetwork(N, hidden=study.low_hidden, seeds=seeds)
+    set_gain(net, start)
     actor = ModularActor(net, N)
     if arm.low == "frozen":
         return Fixed(actor, N)
     if arm.low == "latent":
         return LatentLow(actor, seeds, _latent_model(study), study.task.horizon, study.latent)
     size = CRITIC_SIZE if arm.corrected else ACTOR_SIZE
-    scale = _critic_scale(study)[:size] if arm.corrected else 1.0
-    agent = TD3(actor, seeds, size, N, study.low, stream=2, scale=scale)
+    view = scaled(_critic_scale(study)) if arm.corrected else None
+    agent = TD3(actor, seeds, size, N, study.low, stream=2, view=view)
     weights = {"translation": 100.0 if arm.corrected else 1.0, "rotation": 1.0}
     return CriticLow(
         agent,
@@ -127,6 +127,12 @@ def _latent_model(study: TwoLevelStudy) -> LatentModel:
         np.repeat([1.0, 0.0], 3),
         study.task.tick,
     )
+
+
+def scaled(scale: Array) -> View:
+    """What critics see: (observation * scale, action)."""
+    factor = torch.as_tensor(scale, dtype=torch.float32)
+    return lambda observation, action: torch.cat([observation * factor, action], dim=-1)
 
 
 def _critic_scale(study: TwoLevelStudy) -> Array:
@@ -166,7 +172,8 @@ def build(study: TwoLevelStudy, name: str, seeds: Sequence[int]) -> Trainer:
         env = SegmentEnv(task, planning, config.reward_scale)
         whole = replace(study.ppo, steps=study.task.ticks // study.task.horizon)
         return OneLevelPPO(env, actor, seeds, whole)
-    planner = TD3(actor, seeds, inputs, outputs, study.planner, stream=1)
+    view = CriticView(task, planning) if study.relative else None
+    planner = TD3(actor, seeds, inputs, outputs, study.planner, stream=1, view=view)
     low = build_low(study, name, seeds)
     correction = None
     if isinstance(low, JointLow):
@@ -180,7 +187,7 @@ def _rates(config: HierarchyConfig, arm: Arm) -> HierarchyConfig:
     if arm.low in ("frozen", "gain", "none"):
         config = replace(config, low_updates=0)
     elif arm.low == "latent":
-        config = replace(config, low_updates=4)
+        config = replace(config, low_updates=16, low_updates_late=1, low_late=20_000)
     elif arm.low == "hiro":  # whole segments are large; 25,000 of them are 500,000 ticks
         config = replace(config, capacity=min(config.capacity, 25_000))
     return replace(config, high_noise=arm.noise[0]) if arm.noise else config

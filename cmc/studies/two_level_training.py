@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,9 +14,13 @@ from torch import nn
 
 from cmc import store
 from cmc.learning.low_level import LowLevel
+from cmc.learning.saved import interruptions
 from cmc.learning.seed_axis import single_thread
 from cmc.studies.two_level import Callback, TwoLevelStudy
 from cmc.studies.two_level_parts import Planner, build, frozen, low_actor
+
+SAVE_EVERY = 100.0
+"""Seconds of wall time between two saves of a training's state."""
 
 
 def train(
@@ -28,6 +33,8 @@ def train(
     callback: Callback | None = None,
 ) -> Path:
     """Train a method and keep its policies; a run that was stopped goes on where it was.
+
+    Everything is saved at each kept policy, every `SAVE_EVERY` seconds, and on SIGINT and SIGTERM.
 
     Args:
         study: configuration.
@@ -43,6 +50,7 @@ def train(
     Raises:
         ValueError: for an unknown method, or no seed.
         CheckpointError: if the folder holds a run of another configuration.
+        KeyboardInterrupt: on SIGINT and SIGTERM, once the state is saved.
     """
     total = study.steps if steps is None else steps
     if total < 1:
@@ -59,21 +67,35 @@ def train(
         trainer.load(state, _identity(record))
         kept, _ = store.load_checkpoint(packed, study=study.name, method=name)
         curve = list(kept.pop("rewards"))[: trainer.steps // trainer.stride]
-    while trainer.steps < total:
-        with single_thread():
-            reward = trainer.segment()
-        curve.append(reward.astype(np.float32))
-        done = trainer.steps
-        if callback is not None:
-            callback({"steps": done, "total_steps": total, "reward": reward})
-        last = done >= total
-        every = study.snapshot_every
-        if last or done // every > (done - trainer.stride) // every:
-            mark = done if last and done % every >= trainer.stride else done // every * every
-            for key, value in _weights(trainer.planner.actor, trainer.low).items():
-                kept[f"{mark:08d}.{key}"] = value
-            store.save_checkpoint(packed, {**kept, "rewards": np.array(curve)}, record)
-            trainer.save(state, _identity(record))
+
+    def save() -> None:
+        store.save_checkpoint(packed, {**kept, "rewards": np.array(curve)}, record)
+        trainer.save(state, _identity(record))
+
+    every, saved = study.snapshot_every, time.monotonic()
+    with interruptions() as interrupted:
+        while trainer.steps < total:
+            with single_thread():
+                reward = trainer.segment()
+            curve.append(reward.astype(np.float32))
+            done = trainer.steps
+            last = done >= total
+            keep = last or done // every > (done - trainer.stride) // every
+            if keep:
+                mark = done if last and done % every >= trainer.stride else done // every * every
+                for key, value in _weights(trainer.planner.actor, trainer.low).items():
+                    kept[f"{mark:08d}.{key}"] = value
+            try:
+                if callback is not None:
+                    callback({"steps": done, "total_steps": total, "reward": reward})
+            except KeyboardInterrupt:
+                save()
+                raise
+            if keep or interrupted() or time.monotonic() - saved > SAVE_EVERY:
+                save()
+                saved = time.monotonic()
+            if interrupted():
+                raise KeyboardInterrupt(f"{name}: stopped and saved at step {done}")
     return packed
 
 
