@@ -91,12 +91,12 @@ def set_gain(net: PositiveNetwork | IndependentNetwork, gain: ArrayLike) -> None
     last = net.mlp.weights[-1]  # (seeds n, hidden, 1)
     wanted = torch.as_tensor(np.asarray(gain), dtype=last.dtype).expand(net.seeds or 1, net.n)
     rest = torch.zeros(net.mlp.stack, 1, 2, dtype=last.dtype)
-    positive = isinstance(net, PositiveNetwork)
-    weights = net.positive_weights() if positive else list(net.mlp.weights)
-    slope = net.mlp.slopes(rest, weights)[..., :1]
-    if positive:
+    if isinstance(net, PositiveNetwork):
+        slope = net.mlp.slopes(rest, net.positive_weights())[..., :1]
         last.mul_(wanted.reshape(-1, 1, 1) / slope)
         return
+    weights = list(net.mlp.weights)
+    slope = net.mlp.slopes(rest, weights)[..., :1]
     h = rest + rest.new_tensor([1.0, 0.0])
     for weight in weights[:-1]:
         h = h @ weight

@@ -149,7 +149,7 @@ class TD3:
 
     def _update_actor(self, batch: Batch) -> None:
         config = self.config
-        before = self.actor.net(batch.observation) if config.pull else None
+        before = self.actor.net(batch.observation) if config.pull else None  # type: ignore[operator]
         action = self.actor(batch.observation) if before is None else tanh(before)
         slope = self._action_gradient(batch.observation, action.detach())
         clip = config.action_gradient_clip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -68,6 +68,18 @@ METHODS: dict[str, Arm] = {
     "td3_corrected": Arm(
         "TD3/TD3, corrected critic", "critic", positive=False, capped=False, corrected=True
     ),
+    "ctd3_short": Arm(
+        "TD3/C-TD3, discount .5",
+        "latent",
+        changes={"planner": {"discount": 0.5}, "ppo": {"gamma": 0.5}},
+    ),
+    "ctd3_plain_view": Arm("TD3/C-TD3, plain view", "latent", changes={"relative": False}),
+    "ctd3_no_bursts": Arm(
+        "TD3/C-TD3, Gaussian noise alone",
+        "latent",
+        changes={"hierarchy": {"redraw": (0.0, 0.0), "burst": (0.0, 0.0)}},
+    ),
+    "ctd3_no_pull": Arm("TD3/C-TD3, no pull", "latent", changes={"planner": {"pull": 0.0}}),
     "control": Arm("TD3/Control", "none"),
     "ppo_control": Arm("PPO/Control", "none", planner="ppo"),
     "hiro": Arm("HIRO", "hiro", noise=(1.0, 1.0)),
@@ -154,10 +166,11 @@ class TwoLevelStudy:
         Raises:
             ValueError: if there is no such method.
         """
-        study, arm = self, self.method(name)
+        arm, changes = self.method(name), dict[str, Any]()
         for key, value in arm.changes.items():
-            old = getattr(study, key)
-            study = replace(study, **{key: replace(old, **value) if is_dataclass(old) else value})
+            old: Any = getattr(self, key)
+            changes[key] = replace(old, **value) if isinstance(value, Mapping) else value
+        study = replace(self, **changes)
         if arm.low != "hiro" or self.joint_task is None:
             return study
         start = tuple(start_joints(self.joint_task))

@@ -190,7 +190,9 @@ def _rates(config: HierarchyConfig, arm: Arm) -> HierarchyConfig:
         config = replace(config, low_updates=16, low_updates_late=1, low_late=20_000)
     elif arm.low == "hiro":  # whole segments are large; 25,000 of them are 500,000 ticks
         config = replace(config, capacity=min(config.capacity, 25_000))
-    return replace(config, high_noise=arm.noise[0]) if arm.noise else config
+    if arm.noise:
+        config = replace(config, high_noise=arm.noise[0], high_noise_end=None)
+    return config
 
 
 def low_actor(low: LowLevel) -> nn.Module | None:
