@@ -12,6 +12,7 @@ from matplotlib.image import imread
 from test_view_playback import SCENE, tumble
 
 from cmc.view.playback import Arrow, Marker, notebook, record
+from cmc.view.playback.page import page_id
 
 pytestmark = pytest.mark.browser
 
@@ -148,7 +149,7 @@ def test_overlays_follow_the_time(page, recording):
     assert not goal["visible"]
     assert force["visible"]
     np.testing.assert_allclose(force["quaternion"], [0, 0, 0, 1], atol=1e-6)  # +y is its axis
-    assert page.inner_text("#readouts").split()[-1] == f"{recording.readouts['height [m]'][35]:.3g}"
+    assert page.inner_text(".readouts").split()[-1] == f"{recording.readouts['height [m]'][35]:.3g}"
 
 
 def test_play_pause_keys_slider_and_speed(page):
@@ -176,13 +177,13 @@ def test_play_pause_keys_slider_and_speed(page):
 
 def test_camera_presets_change_the_view_and_follow(page, recording):
     seek(page, 0)
-    names = list(recording.cameras)
     where = "cmcPlayback.viewer.camera.position.toArray()"
-    for index, name in enumerate(names):
+    for index, (name, camera) in enumerate(recording.cameras.items()):
         page.get_by_role("button", name=name, exact=True).click()
-        x, y, z = recording.cameras[name].position
-        np.testing.assert_allclose(page.evaluate(where), [x, z, -y], atol=1e-6)
+        x, y, z = np.atleast_2d(camera.position)[0]
+        np.testing.assert_allclose(page.evaluate(where), [x, z, -y], atol=1e-5)
         page.keyboard.press(str(index + 1))
+    page.get_by_role("button", name="tip: follow", exact=True).click()
     before = np.array(page.evaluate(where))
     seek(page, 0.4)
     step = recording.overlays[0].points[20] - recording.overlays[0].points[0]
@@ -196,7 +197,7 @@ def picture(page):
 
 
 def test_the_scene_is_drawn_and_moves(page):
-    page.keyboard.press("1")
+    page.get_by_role("button", name="whole scene", exact=True).click()
     seek(page, 0)
     page.wait_for_timeout(300)
     first = picture(page)
@@ -208,14 +209,14 @@ def test_the_scene_is_drawn_and_moves(page):
     assert first[5, -5].min() > 0.7  # a light background, even above a grey floor
 
 
-def test_a_slider_beside_the_frame_scrubs_it_without_a_kernel(browser, recording, tmp_path):
-    """The widget's own JavaScript, with a stand-in for the notebook's model, in a parent page."""
-    recording.save(tmp_path / "scene.html")
+@pytest.fixture
+def notebook_page(browser, recording, tmp_path):
+    """The link widget's own JavaScript, with a stand-in for its model, around an embedded page."""
+    embedded = notebook.Embedded(recording.html(), 200)._repr_html_()
     source = base64.b64encode(notebook.LINK_SOURCE.encode()).decode()
-    (tmp_path / "notebook.html").write_text(f"""<!DOCTYPE html>
-      <iframe src="scene.html" sandbox="allow-scripts" width="300" height="200"></iframe>
+    (tmp_path / "notebook.html").write_text(f"""<!DOCTYPE html>{embedded}
       <script type="module">
-        const state = {json.dumps({"scene": notebook.scene_id(recording), "value": 0})};
+        const state = {json.dumps({"scene": page_id([recording]), "value": 0})};
         const heard = [];
         const model = {{ get: (key) => state[key], on: (event, act) => heard.push(act) }};
         const widget = (await import("data:text/javascript;base64,{source}")).default;
@@ -225,17 +226,49 @@ def test_a_slider_beside_the_frame_scrubs_it_without_a_kernel(browser, recording
     page = browser.new_context(offline=True).new_page()
     page.goto((tmp_path / "notebook.html").as_uri())
     until(page, "window.move")
-    frame = page.frames[1]
-    until(frame, "window.cmcPlayback")
-    page.evaluate("move(0.5)")
+    until(page.frames[1], "window.cmcPlayback")
+    yield page
+    page.context.close()
+
+
+def test_a_slider_beside_the_frame_scrubs_it_without_a_kernel(notebook_page):
+    frame = notebook_page.frames[1]
+    notebook_page.evaluate("move(0.5)")
     until(frame, "cmcPlayback.state().time === 0.5")
-    page.evaluate(
+    notebook_page.evaluate(
         "document.querySelector('iframe').contentWindow"
         ".postMessage({ cmcPlayback: 'another', seek: 0.1 }, '*')"
     )
-    page.evaluate("move(0.6)")
+    notebook_page.evaluate("move(0.6)")
     until(frame, "cmcPlayback.state().time === 0.6")
-    page.context.close()
+
+
+def test_one_message_seeks_once_and_the_page_answers_none(notebook_page):
+    """The viewer's bundle holds a worker that would answer each message to its own window."""
+    frame = notebook_page.frames[1]
+    frame.evaluate("window.heard = 0; addEventListener('message', () => { heard += 1 })")
+    for k in range(1, 11):
+        notebook_page.evaluate(f"move({0.05 * k})")
+    until(frame, "heard === 10")
+    seen = set()
+    for _ in range(10):
+        notebook_page.wait_for_timeout(20)
+        seen.add(frame.evaluate("cmcPlayback.state().time"))
+    assert seen == {0.5}
+    assert frame.evaluate("heard") == 10
+    frame.evaluate("cmcPlayback.setSpeed(0.01); cmcPlayback.setPlaying(true)")
+    until(frame, "cmcPlayback.state().time > 0.5")
+    assert frame.evaluate("cmcPlayback.state().playing")
+
+
+def test_with_a_slider_beside_it_the_page_has_none(browser, recording, tmp_path):
+    for slider in (True, False):
+        (tmp_path / "a.html").write_text(recording.html(slider=slider))
+        page = browser.new_context(offline=True).new_page()
+        page.goto((tmp_path / "a.html").as_uri())
+        until(page, "window.cmcPlayback")
+        assert page.locator("#time").is_visible() == slider
+        page.context.close()
 
 
 def test_live_view_moves_a_body_in_the_browser(browser, model):

@@ -1,19 +1,21 @@
 """Playback without a browser: what is recorded, how it is packed, what the live view leaves."""
 
 import base64
+import html as html_
 import json
 import re
 
+import ipywidgets
 import mujoco
 import numpy as np
 import pytest
 import umsgpack
 
-from cmc.view.playback import Arrow, Camera, Marker, around, notebook, record
+from cmc.view.playback import Arrow, Camera, Marker, around, record
 from cmc.view.playback.cameras import FIELD_OF_VIEW
 from cmc.view.playback.geometry import color, geom_mesh
 from cmc.view.playback.overlays import as_overlays
-from cmc.view.playback.page import scene_data, scene_id
+from cmc.view.playback.page import page_id, scene_data
 
 SCENE = """
 <mujoco>
@@ -49,6 +51,10 @@ SCENE = """
   </worldbody>
 </mujoco>
 """
+
+
+def page_id_of(scene):
+    return page_id([scene])
 
 
 @pytest.fixture(scope="module")
@@ -175,9 +181,9 @@ def test_colors_follow_mujoco_s_rule(model):
 def test_the_same_recording_is_the_same_page(model, recording):
     again = record(model, *tumble(model)[::2], trails=["tip"], title="Tumble")
     assert again.html() == recording.html()
-    assert scene_id(again) == scene_id(recording)
+    assert page_id_of(again) == page_id_of(recording)
     other = record(model, *tumble(model, seed=1)[::2], trails=["tip"], title="Tumble")
-    assert scene_id(other) != scene_id(recording)
+    assert page_id_of(other) != page_id_of(recording)
 
 
 def test_page_loads_nothing_and_says_so(recording):
@@ -258,15 +264,6 @@ def test_bad_trajectories_are_refused(model, change, message):
         record(model, *change(qpos, times))
 
 
-def test_height_fields_are_refused_by_name():
-    model = mujoco.MjModel.from_xml_string(
-        '<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset><worldbody>'
-        '<geom name="hill" type="hfield" hfield="h"/></worldbody></mujoco>'
-    )
-    with pytest.raises(ValueError, match="hill is a mjGEOM_HFIELD"):
-        record(model, np.zeros((1, 0)), [0.0])
-
-
 def test_default_camera_frames_every_solid_geom(model, recording):
     """Every geom's centre lies in the cone of the first preset."""
     camera = next(iter(recording.cameras.values()))
@@ -287,37 +284,43 @@ def test_default_camera_frames_every_solid_geom(model, recording):
 
 
 def test_shown_in_a_notebook_as_a_frame_on_the_file(recording, tmp_path, monkeypatch):
+    """The page has the one time slider: nothing else is shown."""
     monkeypatch.chdir(tmp_path)
-    shown = []
-    monkeypatch.setattr(notebook, "display", shown.append)
-    box = recording.show("playback/tumble.html", height=300)
-    slider, link = box.children
-    markup = shown[0]._repr_html_()
-    assert 'src="playback/tumble.html"' in markup
-    assert "srcdoc" not in markup
+    frame = recording.show("playback/tumble.html", height=300)
+    assert 'src="playback/tumble.html"' in frame._repr_html_()
     assert (tmp_path / "playback/tumble.html").stat().st_size > 800_000
-    assert link.scene == scene_id(recording)
-    assert slider.max == pytest.approx(0.78)
-    assert slider.step == pytest.approx(0.02)
     for path in (tmp_path / "x.html", "../x.html"):
         with pytest.raises(ValueError, match="relative"):
             recording.show(path)
 
 
-def test_fixed_cameras_and_goal_zones_of_the_model_are_taken_over():
+def test_embedded_in_the_notebook_without_a_file(recording, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    markup = html_.unescape(recording.show()._repr_html_())
+    assert recording.html() in markup
+    assert 'sandbox="allow-scripts"' in markup
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_slider_of_ones_own_replaces_the_page_s(recording, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    mine = ipywidgets.FloatSlider(max=0.78)
+    frame, slider, link = recording.show("playback/tumble.html", slider=mine).children
+    assert "playback/tumble.html" in frame.value
+    assert slider is mine
+    assert link.scene == page_id_of(recording)
+    assert '"slider":false' in (tmp_path / "playback/tumble.html").read_text()
+    assert '"slider":true' in recording.html()
+
+
+def test_goal_zones_of_the_model_are_taken_over():
     model = mujoco.MjModel.from_xml_string(
         """<mujoco><asset><material name="goal" rgba="0 1 0 .4"/></asset><worldbody>
-        <body pos="0 0 1"><camera name="desk" pos="2 0 0" xyaxes="0 1 0 0 0 1"/></body>
-        <body><joint/><camera name="moving"/><geom size=".1"/></body>
+        <body><joint/><geom size=".1"/></body>
         <site name="zone" type="box" size=".1 .2 .3" pos="1 2 3" material="goal"/>
         <site name="frame" size=".1"/></worldbody></mujoco>"""
     )
     made = record(model, np.zeros((1, 1)), [0.0])
-    assert list(made.cameras) == ["whole scene", "desk"]
-    assert made.cameras["desk"].position == pytest.approx((2, 0, 1))
-    along = np.subtract(made.cameras["desk"].target, made.cameras["desk"].position)
-    assert along[0] < 0
-    np.testing.assert_allclose(along[1:], 0, atol=1e-12)
     drawn = {c["path"]: c for c in commands(made) if c["type"] == "set_object"}
     assert "/meshcat/world/site1" not in drawn
     box = drawn["/meshcat/world/site0"]["object"]
@@ -326,15 +329,6 @@ def test_fixed_cameras_and_goal_zones_of_the_model_are_taken_over():
     place = next(c["matrix"] for c in commands(made) if c["path"] == "/meshcat/world/site0"
                  and c["type"] == "set_transform")  # fmt: skip
     assert place[12:15] == [1, 2, 3]
-
-
-def test_live_is_one_argument_away(recording, monkeypatch):
-    shown = []
-    monkeypatch.setattr(notebook, "display", shown.append)
-    with recording.show("playback/unused.html", live=True) as live:
-        assert f'src="{live.url}"' in shown[0]._repr_html_()
-        assert live.url.startswith("http://127.0.0.1:")
-    assert live.closed
 
 
 def test_own_cameras_replace_the_presets(model):
@@ -354,3 +348,74 @@ def test_markers_without_a_color_get_different_ones():
     assert None not in colors
     assert len(set(colors)) == 3
     assert colors[2] == 7
+
+
+def test_height_fields_lie_where_mujoco_has_them():
+    """Rays down onto MuJoCo's field meet the drawn surface."""
+    xml = """<mujoco><asset><hfield name="h" nrow="3" ncol="4" size="2 1 .5 .1"
+      elevation="0 1 2 3 0 4 1 0 2 2 0 5"/></asset><worldbody>
+      <geom name="hill" type="hfield" hfield="h"/></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    geometry = geom_mesh(model, 0)[0].geometry
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert len(geometry.vertices) == 12
+    for x, y, z in geometry.vertices * [0.999, 0.999, 1]:
+        found = np.zeros(1, dtype=np.int32)
+        down = mujoco.mj_ray(
+            model, data, np.array([x, y, 2.0]), np.array([0, 0, -1.0]), None, 1, -1, found
+        )
+        assert 2.0 - down == pytest.approx(z, abs=2e-3)
+    assert record(model, np.zeros((1, 0)), [0.0]).commands
+
+
+def test_what_cannot_be_drawn_is_named_and_the_rest_is_drawn(model, monkeypatch):
+    qpos, _, times = tumble(model, frames=2)
+
+    def refuse(*arguments):
+        raise ValueError("geom strange has no counterpart")
+
+    monkeypatch.setattr("cmc.view.playback.drawing.geom_mesh", refuse)
+    with pytest.warns(UserWarning, match="left out: geom strange"):
+        made = record(model, qpos, times)
+    assert len(made.bodies) == 4
+
+
+def test_an_empty_picture_is_a_warning(model):
+    qpos, _, times = tumble(model, frames=2)
+    with pytest.warns(UserWarning, match=r"nothing of groups \(5,\) is seen; geoms: \[0, 3\]"):
+        record(model, qpos, times, groups=(5,))
+
+
+def test_a_recording_may_end_when_the_action_does(model):
+    """Half a second after the last motion: of 4 s of which 1 s moves, 1.5 s stay."""
+    times = 0.1 * np.arange(41)
+    qpos = np.tile(tumble(model, frames=1)[0], (41, 1))
+    qpos[:, 0] = np.minimum(times, 1.0)
+    whole = record(model, qpos, times, trails=["tip"], readouts={"x": times})
+    made = record(model, qpos, times, trails=["tip"], readouts={"x": times}, tail=0.5)
+    assert len(whole.times) == 41
+    assert made.times[-1] == pytest.approx(1.4, abs=0.11)
+    assert len(made.poses) == len(made.times) == len(made.readouts["x"])
+    assert made.overlays[0].points.shape == (len(made.times), 3)
+    assert len(np.atleast_2d(made.cameras["tip: follow"].position)) == len(made.times)
+
+
+def test_labels_and_cameras_that_name_nothing_are_refused(model):
+    lost = Camera((1, 0, 0), (0, 0, 0), follow="nowhere")
+    qpos, _, times = tumble(model, frames=2)
+    for wrong in (
+        {"labels": {"a": "nowhere"}},
+        {"cameras": {"a": lost}},
+    ):
+        with pytest.raises(ValueError, match="no site and no body named"):
+            record(model, qpos, times, **wrong)
+
+
+def test_a_textured_shape_without_a_map_has_the_mean_color():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><asset><texture name="t" type="2d" builtin="checker" rgb1="1 0 0" rgb2="0 0 1"
+        width="16" height="16"/><material name="m" texture="t"/></asset><worldbody>
+        <geom size=".1" material="m"/></worldbody></mujoco>"""
+    )
+    assert color(model, 0) == pytest.approx((0.5, 0, 0.5, 1), abs=0.01)

@@ -2,13 +2,14 @@
 
 recording = record(model, qpos, times, trails=["tip"])
 recording.save("maze.html")           # a file to open, mail or publish
-recording.show("playback/maze.html")  # in a notebook, with a slider that needs no kernel
+recording.show("playback/maze.html")  # in a notebook; without a path, inside the notebook
+beside(success, failure).show()       # two scenes under one time slider
 with recording.serve() as live:       # meshcat live on the loopback interface
     live.update(data)
 """
 
 from cmc.view.playback.cameras import Camera, around
 from cmc.view.playback.overlays import Arrow, Marker, Trail
-from cmc.view.playback.recorder import Recording, record
+from cmc.view.playback.recorder import Recording, beside, record
 
-__all__ = ["Arrow", "Camera", "Marker", "Recording", "Trail", "around", "record"]
+__all__ = ["Arrow", "Camera", "Marker", "Recording", "Trail", "around", "beside", "record"]

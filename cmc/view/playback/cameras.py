@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import mujoco
@@ -10,19 +10,32 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-FIELD_OF_VIEW = 40.0  # vertical, degrees; the page's camera uses the same
+FIELD_OF_VIEW = 40.0  # vertical, degrees, unless a camera has its own
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera at `position` that looks at `target`, both (x, y, z) in m, z up.
+    """A camera at `position` that looks at `target`, both (3,) or (T, 3) in m, z up.
 
-    With `follow` set to the name of a trail the camera moves along with it.
+    Attributes:
+        position: where it stands; a row a frame if it moves.
+        target: what it looks at.
+        follow: name of a trail, site or body that it moves along with, beside its own motion.
+        up: direction that is up in the picture, (3,) or (T, 3).
+        field_of_view: vertical, degrees.
     """
 
-    position: tuple[float, float, float]
-    target: tuple[float, float, float]
+    position: ArrayLike
+    target: ArrayLike
     follow: str | None = None
+    up: ArrayLike = (0.0, 0.0, 1.0)
+    field_of_view: float = FIELD_OF_VIEW
+
+    def along(self, track: Array) -> Camera:
+        """The same camera carried along a track (T, 3), from where it stands at the first frame."""
+        shift = track - track[0]
+        position, target = np.asarray(self.position) + shift, np.asarray(self.target) + shift
+        return Camera(position, target, None, self.up, self.field_of_view)
 
 
 def around(
@@ -35,6 +48,9 @@ def around(
     """Camera that frames a ball: `radius` in m, seen from `azimuth` and `elevation` in degrees.
 
     Azimuth 0 looks from +x towards the center, 90 from +y.
+
+    Raises:
+        ValueError: for a center that is not three finite numbers, or a radius that is not positive.
     """
     middle = np.asarray(center, dtype=float)
     if middle.shape != (3,) or not np.isfinite(middle).all():
@@ -44,56 +60,68 @@ def around(
     a, e = np.deg2rad([azimuth, elevation])
     direction = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     position = middle + direction * radius / np.sin(np.deg2rad(FIELD_OF_VIEW / 2))
-    return Camera(_triple(position), _triple(middle), follow)
+    return Camera(tuple(map(float, position)), tuple(map(float, middle)), follow)
 
 
-def scene_ball(
-    model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[int]
-) -> tuple[Array, float]:
-    """Center and radius of a ball around the listed geoms, planes left out; needs kinematics."""
-    solid = [g for g in geoms if model.geom_type[g] != mujoco.mjtGeom.mjGEOM_PLANE]
-    if not solid:
+def ball(low: Array, high: Array) -> tuple[Array, float]:
+    """Center and radius of a ball around boxes with corners low and high, both (..., 3)."""
+    if not low.size:
         return np.zeros(3), 1.0
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    boxes = model.geom_aabb[solid]
-    local = boxes[:, None, :3] + corners * boxes[:, None, 3:]
-    frames = data.geom_xmat[solid].reshape(-1, 3, 3)
-    world = np.einsum("gij,gcj->gci", frames, local) + data.geom_xpos[solid][:, None]
-    low, high = world.min(axis=(0, 1)), world.max(axis=(0, 1))
-    return (low + high) / 2, float(np.linalg.norm(high - low) / 2)
+    low, high = low.reshape(-1, 3).min(axis=0), high.reshape(-1, 3).max(axis=0)
+    return (low + high) / 2, max(float(np.linalg.norm(high - low) / 2), 1e-3)
 
 
 def default_cameras(
-    model: mujoco.MjModel,
-    data: mujoco.MjData,
-    ball: tuple[Array, float],
-    trails: dict[str, Array],
+    everything: tuple[Array, float],
+    subject: tuple[Array, float],
+    track: Array,
+    trails: Mapping[str, Array],
 ) -> dict[str, Camera]:
-    """Presets: the whole scene, the model's own fixed cameras, and views of each trail.
+    """Presets: each trail from near, from the side and moving along, the whole, and what moves.
 
-    A trail is seen from near, from above, from the side, and moving along with it.
+    Args:
+        everything: ball around all that is drawn, over the whole motion.
+        subject: ball around what moves, at the first frame.
+        track: where the middle of what moves is, (T, 3).
+        trails: points by name, (T, 3).
     """
-    presets = {"whole scene": around(*ball)}
-    focus = next(iter(trails.values())).mean(axis=0) if trails else ball[0]
-    mujoco.mj_camlight(model, data)
-    still = model.body_weldid[model.cam_bodyid] == 0
-    for camera in np.flatnonzero(still & (model.cam_mode == mujoco.mjtCamLight.mjCAMLIGHT_FIXED)):
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, int(camera))
-        position, ahead = data.cam_xpos[camera], -data.cam_xmat[camera].reshape(3, 3)[:, 2]
-        reach = max(float((focus - position) @ ahead), 0.01)
-        preset = Camera(_triple(position), _triple(position + reach * ahead))
-        presets[name or f"camera {camera}"] = preset
+    presets = {}
     for name, points in trails.items():
         low, high = points.min(axis=0), points.max(axis=0)
-        radius = max(0.75 * float(np.linalg.norm(high - low)), 0.04 * ball[1])
+        radius = max(0.75 * float(np.linalg.norm(high - low)), 0.04 * everything[1])
         middle = (low + high) / 2
         presets[f"{name}: near"] = around(middle, radius, elevation=40.0)
-        presets[f"{name}: above"] = around(middle, radius, azimuth=-90.0, elevation=88.0)
         presets[f"{name}: side"] = around(middle, radius, azimuth=-90.0, elevation=8.0)
-        presets[f"{name}: follow"] = around(points[0], radius, elevation=40.0, follow=name)
+        presets[f"{name}: follow"] = around(points[0], radius, elevation=40.0).along(points)
+    presets["whole scene"] = around(*everything)
+    if subject[1] < 0.5 * everything[1]:
+        follow = {"follow": around(*subject).along(track)}
+        # What is a dot in the whole scene is followed from the start.
+        dot = subject[1] < 0.2 * everything[1] and not trails
+        presets = follow | presets if dot else presets | follow
     return presets
 
 
-def _triple(vector: Array) -> tuple[float, float, float]:
-    x, y, z = (float(c) for c in vector)
-    return x, y, z
+def model_cameras(model: mujoco.MjModel, place: Array, axes: Array, focus: Array) -> dict:
+    """The model's own cameras with their motion, roll and field of view.
+
+    Args:
+        model: the compiled model.
+        place: positions (T, ncam, 3).
+        axes: rotations (T, ncam, 3, 3).
+        focus: the point (3,) or (T, 3) at whose depth the camera's target is put.
+    """
+    presets: dict[str, Camera] = {}
+    for c in range(model.ncam):
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, c) or f"camera {c}"
+        ahead, position, up = -axes[:, c, :, 2], place[:, c], axes[:, c, :, 1]
+        depth = np.maximum(((focus - position) * ahead).sum(axis=1, keepdims=True), 0.01)
+        field = float(model.cam_fovy[c])
+        if model.cam_sensorsize[c, 1] > 0:  # a lens in place of an angle
+            half = model.cam_sensorsize[c, 1] / 2 / model.cam_intrinsic[c, 1]
+            field = float(np.rad2deg(2 * np.arctan(half)))
+        if model.cam_projection[c]:  # no perspective: from as far as shows as much
+            depth = np.full_like(depth, field / 2 / np.tan(np.deg2rad(FIELD_OF_VIEW / 2)))
+            position, field = position + ahead * (depth[0] - depth), FIELD_OF_VIEW
+        presets[name] = Camera(position, position + depth * ahead, None, up, field)
+    return presets

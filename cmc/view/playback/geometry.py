@@ -1,10 +1,13 @@
 """MuJoCo geoms as meshcat objects: one geometry, one material and one local transform per geom.
 
-Textures are not mapped; colors, transparency and sizes are. meshcat's cylinders (and the capsules
-built here) have their axis along y, MuJoCo's along z, so both are turned by a quarter about x.
+Colors, transparency and sizes are MuJoCo's. Textures are mapped onto planes, boxes and meshes with
+texture coordinates; elsewhere a texture becomes its mean color. meshcat's cylinders (and the
+capsules built here) have their axis along y, MuJoCo's along z: both are turned about x.
 """
 
 from __future__ import annotations
+
+import io
 
 import mujoco
 import numpy as np
@@ -12,11 +15,14 @@ from meshcat import geometry as mg
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Rgba = tuple[float, float, float, float]
+G = mujoco.mjtGeom
 
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-Rgba = tuple[float, float, float, float]
 _DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
-_INFINITE = 30.0  # half-size in metres at which a plane without bounds is drawn
+_INFINITE = 60.0  # half-size in metres at which a plane without bounds is drawn
+_LARGEST = 512  # pixels across a texture; larger ones are made smaller
+_TRIANGLES = (G.mjGEOM_MESH, G.mjGEOM_SDF)
 
 
 class Capsule(mg.Geometry):
@@ -38,12 +44,8 @@ class Capsule(mg.Geometry):
 
     def lower(self, object_data: dict) -> dict:
         """The geometry as three.js reads it from JSON."""
-        return {
-            "uuid": self.uuid,
-            "type": "LatheGeometry",
-            "points": [{"x": max(float(x), 0.0), "y": float(y)} for x, y in self.profile],
-            "segments": 32,
-        }
+        points = [{"x": max(float(x), 0.0), "y": float(y)} for x, y in self.profile]
+        return {"uuid": self.uuid, "type": "LatheGeometry", "points": points, "segments": 32}
 
 
 class RoundEllipsoid(mg.Ellipsoid):
@@ -52,6 +54,30 @@ class RoundEllipsoid(mg.Ellipsoid):
     def lower(self, object_data: dict) -> dict:
         """The geometry as three.js reads it from JSON."""
         return super().lower(object_data) | {"widthSegments": 32, "heightSegments": 24}
+
+
+class Triangles(mg.TriangularMeshGeometry):
+    """Vertices (V, 3), faces (F, 3), and texture coordinates (V, 2) whose v counts rows down."""
+
+    def __init__(self, vertices: Array, faces: NDArray[np.integer], uv: Array | None = None):
+        super().__init__(vertices, faces)
+        self.uv = uv
+
+    def lower(self, object_data: dict) -> dict:
+        """The geometry as three.js reads it from JSON."""
+        data = super().lower(object_data)
+        if self.uv is not None:
+            packed = mg.pack_numpy_array(np.asarray(self.uv, np.float32).T)
+            data["data"]["attributes"]["uv"] = packed
+        return data
+
+
+class Known(mg.Geometry):
+    """Stands for a geometry of the same uuid that the page already holds."""
+
+    def lower(self, object_data: dict) -> dict:
+        """A point of a geometry, which the page replaces."""
+        return {"uuid": self.uuid, "type": "BoxGeometry", "width": 0, "height": 0, "depth": 0}
 
 
 def transform(position: Array, quaternion: Array) -> Array:
@@ -64,93 +90,227 @@ def transform(position: Array, quaternion: Array) -> Array:
 
 def color(model: mujoco.MjModel, geom: int) -> Rgba:
     """Color MuJoCo shows: the geom's own unless it is the default grey and a material is set."""
-    return _rgba(model, model.geom_rgba[geom], int(model.geom_matid[geom]))
+    return shown_rgba(model, model.geom_rgba[geom], int(model.geom_matid[geom]))
 
 
-def geom_mesh(model: mujoco.MjModel, geom: int) -> tuple[mg.Mesh, Array]:
+def geom_mesh(
+    model: mujoco.MjModel, geom: int, known: set[str] | None = None
+) -> tuple[mg.Mesh, Array]:
     """Meshcat object of one geom and its 4x4 transform in the frame of its body.
 
+    Args:
+        model: the compiled model.
+        geom: its number.
+        known: geometries drawn before, by uuid; what is drawn here is added, and not sent again.
+
     Raises:
-        ValueError: for height fields, signed-distance geoms and other types without a counterpart.
+        ValueError: for a type without a counterpart.
     """
-    kind = mujoco.mjtGeom(model.geom_type[geom])
-    if kind == mujoco.mjtGeom.mjGEOM_MESH:
-        geometry, turned = _mesh(model, int(model.geom_dataid[geom])), False
-    else:
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"number {geom}"
-        geometry, turned = _shape(f"geom {name}", kind, model.geom_size[geom])
-    mesh = _dressed(geometry, kind, color(model, geom), f"geom{geom}")
+    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom) or f"number {geom}"
+    kind, size = G(model.geom_type[geom]), model.geom_size[geom]
+    material, dataid = int(model.geom_matid[geom]), int(model.geom_dataid[geom])
+    geometry, mapped = _textured(model, kind, size, material, dataid)
+    turned = False
+    if geometry is None:
+        geometry, turned = _shape(f"geom {name}", model, kind, size, dataid)
+    mesh = _dressed(model, geometry, kind, color(model, geom), material if mapped else -1)
+    _name(mesh, f"geom{geom}")
+    if kind in _TRIANGLES and not mapped:
+        geometry.uuid = f"mesh{dataid}"
+        if known is not None and geometry.uuid in known:
+            mesh.geometry, uuid = Known(), geometry.uuid
+            mesh.geometry.uuid = uuid
+        (set() if known is None else known).add(geometry.uuid)
     local = transform(model.geom_pos[geom], model.geom_quat[geom])
     return mesh, local @ _Y_TO_Z if turned else local
 
 
 def site_mesh(model: mujoco.MjModel, site: int) -> tuple[mg.Mesh, Array]:
     """Meshcat object of one site, such as a goal zone, and its transform in its body's frame."""
-    kind = mujoco.mjtGeom(model.site_type[site])
-    geometry, turned = _shape(f"site number {site}", kind, model.site_size[site])
-    rgba = _rgba(model, model.site_rgba[site], int(model.site_matid[site]))
+    kind = G(model.site_type[site])
+    geometry, turned = _shape(f"site number {site}", model, kind, model.site_size[site], -1)
+    rgba = shown_rgba(model, model.site_rgba[site], int(model.site_matid[site]))
     local = transform(model.site_pos[site], model.site_quat[site])
-    mesh = _dressed(geometry, kind, rgba, f"site{site}")
+    mesh = _dressed(model, geometry, kind, rgba, -1)
+    _name(mesh, f"site{site}")
     return mesh, local @ _Y_TO_Z if turned else local
 
 
-def _rgba(model: mujoco.MjModel, rgba: Array, material: int) -> Rgba:
-    if material >= 0 and np.allclose(rgba, _DEFAULT_RGBA):
-        rgba = model.mat_rgba[material]
-    r, g, b, a = (float(c) for c in np.clip(rgba, 0.0, 1.0))
-    return r, g, b, a
+def own_rgba(model: mujoco.MjModel, rgba: Array, material: int) -> Array:
+    """The own color (4,), or the material's where that is the default."""
+    return model.mat_rgba[material] if material >= 0 and np.allclose(rgba, _DEFAULT_RGBA) else rgba
 
 
-def _dressed(geometry: mg.Geometry, kind: mujoco.mjtGeom, rgba: Rgba, name: str) -> mg.Mesh:
+def shown_rgba(model: mujoco.MjModel, rgba: Array, material: int) -> Rgba:
+    """The own color, or the material's where that is the default, times the texture's mean."""
+    rgba = own_rgba(model, rgba, material)
+    pixels = texture(model, material)
+    mean = np.ones(3) if pixels is None else pixels.reshape(-1, pixels.shape[-1]).mean(axis=0) / 255
+    r, g, b = (float(c) for c in np.clip(rgba[:3] * np.resize(mean, 4)[:3], 0.0, 1.0))
+    return r, g, b, float(np.clip(rgba[3], 0.0, 1.0))
+
+
+def texture(model: mujoco.MjModel, material: int) -> NDArray[np.uint8] | None:
+    """Pixels (rows, columns, 3) of a material's color texture, or None."""
+    if material < 0:
+        return None
+    roles = (mujoco.mjtTextureRole.mjTEXROLE_RGB, mujoco.mjtTextureRole.mjTEXROLE_RGBA)
+    index = max(int(model.mat_texid[material, int(role)]) for role in roles)
+    if index < 0:
+        return None
+    rows, columns = int(model.tex_height[index]), int(model.tex_width[index])
+    channels, first = int(model.tex_nchannel[index]), int(model.tex_adr[index])
+    pixels = model.tex_data[first : first + rows * columns * channels]
+    pixels = pixels.reshape(rows, columns, channels)
+    return np.repeat(pixels, 3, axis=-1)[..., :3] if channels < 3 else pixels[..., :3]
+
+
+def _textured(
+    model: mujoco.MjModel, kind: mujoco.mjtGeom, size: Array, material: int, dataid: int
+) -> tuple[mg.Geometry | None, bool]:
+    """Triangles with texture coordinates, where the material's texture can be mapped."""
+    pixels = texture(model, material)
+    if pixels is None:
+        return None, False
+    repeat, uniform = model.mat_texrepeat[material], bool(model.mat_texuniform[material])
+    if kind == G.mjGEOM_PLANE and len(pixels) < 2 * pixels.shape[1]:
+        half = np.where(size[:2] > 0, size[:2], _INFINITE)
+        # "uniform" in MuJoCo: `repeat` times in two metres
+        per_metre = repeat / 2 if uniform or not size[:2].all() else repeat / (2 * half)
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
+        uv = corners * per_metre * [1, -1] + 0.5
+        return Triangles(np.c_[corners, np.zeros(4)], np.array([[0, 1, 2], [0, 2, 3]]), uv), True
+    if kind == G.mjGEOM_HFIELD:
+        surface = _height_field(model, dataid)
+        share = surface.vertices[:, :2] / model.hfield_size[dataid, :2] * [1, -1]
+        size_ = model.hfield_size[dataid, :2] if uniform else 1.0
+        surface.uv = share * size_ * repeat / 2 + 0.5
+        return surface, True
+    if kind == G.mjGEOM_BOX:
+        return _textured_box(size, pixels, repeat * size[:2] if uniform else repeat), True
+    if kind == G.mjGEOM_MESH and model.mesh_texcoordnum[dataid] > 0:
+        vertices, faces, uv_faces = _mesh_arrays(model, dataid)
+        first = model.mesh_texcoordadr[dataid]
+        uv = model.mesh_texcoord[first : first + model.mesh_texcoordnum[dataid]] * repeat
+        pairs, index = np.unique(
+            np.stack([faces.ravel(), uv_faces.ravel()]), axis=1, return_inverse=True
+        )
+        return Triangles(vertices[pairs[0]], index.reshape(-1, 3), uv[pairs[1]]), True
+    return None, False
+
+
+def _textured_box(size: Array, pixels: NDArray[np.uint8], repeat: Array) -> Triangles:
+    """A box; a cube's texture holds one square a face below each other: x, -x, y, -y, z, -z."""
+    squares = max(1, len(pixels) // pixels.shape[1])
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    vertices, faces, uv = [], [], []
+    for face in range(6):
+        axis, sign = face // 2, 1 - 2 * (face % 2)
+        points = np.empty((4, 3))
+        points[:, axis] = sign
+        points[:, [k for k in range(3) if k != axis]] = corners
+        x, y, z = points.T
+        if squares == 6:  # OpenGL's cube map: which coordinate runs along a row, which down
+            s, t = ((-sign * z, -y), (x, sign * z), (sign * x, -y))[axis]
+            uv.append(np.stack([(s + 1) / 2, (face + (t * 0.998 + 1) / 2) / 6], axis=1))
+        else:
+            uv.append(np.stack([x, -y], axis=1) * repeat / 2 + 0.5)
+        outwards = np.cross(points[1] - points[0], points[2] - points[0])[axis] * sign > 0
+        order = np.array([[0, 1, 2], [0, 2, 3]] if outwards else [[0, 2, 1], [0, 3, 2]])
+        vertices.append(points * size)
+        faces.append(order + 4 * face)
+    return Triangles(np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv))
+
+
+def _dressed(
+    model: mujoco.MjModel, geometry: mg.Geometry, kind: mujoco.mjtGeom, rgba: Rgba, material: int
+) -> mg.Mesh:
     """A geometry with its material; three.js sees both sides of open shapes only."""
-    r, g, b, a = rgba
-    plane, triangles = kind == mujoco.mjtGeom.mjGEOM_PLANE, kind == mujoco.mjtGeom.mjGEOM_MESH
-    material = mg.MeshPhongMaterial(
+    plane, open_ = kind == G.mjGEOM_PLANE, isinstance(geometry, mg.TriangularMeshGeometry)
+    image, (r, g, b, a) = None, rgba
+    if material >= 0:
+        r, g, b = (float(c) for c in model.mat_rgba[material, :3])
+        image = mg.ImageTexture(mg.PngImage(_png(texture(model, material))), wrap=[1000, 1000])
+    dressed = mg.MeshPhongMaterial(
         color=(round(255 * r) << 16) + (round(255 * g) << 8) + round(255 * b),
+        map=image,
         opacity=a,
-        side=2 if plane or triangles else 0,
+        side=2 if open_ else 0,
         shininess=35,
         specular=0x2A2A2A,
-        flatShading=triangles,
+        flatShading=kind in _TRIANGLES or kind == G.mjGEOM_BOX,
         depthWrite=a == 1.0,  # what lies behind a see-through wall is seen from every side
         polygonOffset=plane,  # lines drawn on a floor stay visible
         polygonOffsetFactor=1,
         polygonOffsetUnits=1,
     )
-    mesh = mg.Mesh(geometry, material)
-    # meshcat draws random uuids; fixed ones make the same recording the same file
-    mesh.uuid, geometry.uuid, material.uuid = (
-        f"{part} {name}" for part in ("mesh", "shape", "mat")
-    )
-    return mesh
+    return mg.Mesh(geometry, dressed)
 
 
-def _mesh(model: mujoco.MjModel, mesh: int) -> mg.Geometry:
+def _name(mesh: mg.Mesh, name: str) -> None:
+    """Replace meshcat's random uuids, so that the same recording is the same file."""
+    parts = {"mesh": mesh, "shape": mesh.geometry, "mat": mesh.material}
+    if mesh.material.map is not None:
+        parts |= {"map": mesh.material.map, "image": mesh.material.map.image}
+    for part, element in parts.items():
+        element.uuid = f"{part} {name}"
+
+
+def _png(pixels: NDArray[np.uint8] | None) -> bytes:
+    from PIL import Image
+
+    assert pixels is not None
+
+    image, stream = Image.fromarray(np.ascontiguousarray(pixels[::-1])), io.BytesIO()
+    share = min(1.0, _LARGEST / image.width)
+    image = image.resize((max(1, round(image.width * share)), max(1, round(image.height * share))))
+    image.save(stream, "PNG")
+    return stream.getvalue()
+
+
+def _mesh_arrays(
+    model: mujoco.MjModel, mesh: int
+) -> tuple[Array, NDArray[np.integer], NDArray[np.integer]]:
     first, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+    rows = slice(face, face + model.mesh_facenum[mesh])
     vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
-    return mg.TriangularMeshGeometry(
-        vertices, model.mesh_face[face : face + model.mesh_facenum[mesh]]
-    )
+    return vertices, model.mesh_face[rows], model.mesh_facetexcoord[rows]
 
 
-def _shape(what: str, kind: mujoco.mjtGeom, sizes: Array) -> tuple[mg.Geometry, bool]:
-    """A primitive, and whether its axis is y and must be turned to MuJoCo's z."""
+def _height_field(model: mujoco.MjModel, field: int) -> Triangles:
+    """The surface of a height field; MuJoCo's base below it is not drawn."""
+    rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+    x, y, top, _ = model.hfield_size[field]
+    first = model.hfield_adr[field]
+    height = top * model.hfield_data[first : first + rows * columns]
+    X, Y = np.meshgrid(np.linspace(-x, x, columns), np.linspace(-y, y, rows))
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    right, above = corner + 1, corner + columns
+    faces = np.concatenate([np.c_[corner, right, above + 1], np.c_[corner, above + 1, above]])
+    return Triangles(np.c_[X.ravel(), Y.ravel(), height], faces)
+
+
+def _shape(
+    what: str, model: mujoco.MjModel, kind: mujoco.mjtGeom, sizes: Array, dataid: int
+) -> tuple[mg.Geometry, bool]:
+    """A plain shape, and whether its axis is y and must be turned to MuJoCo's z."""
     size = [float(s) for s in sizes]
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+    if kind in _TRIANGLES and dataid >= 0:
+        return Triangles(*_mesh_arrays(model, dataid)[:2]), False
+    if kind == G.mjGEOM_HFIELD:
+        return _height_field(model, dataid), False
+    if kind == G.mjGEOM_SPHERE:
         return RoundEllipsoid([size[0]] * 3), False
-    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+    if kind == G.mjGEOM_ELLIPSOID:
         return RoundEllipsoid(size), False
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+    if kind == G.mjGEOM_BOX:
         return mg.Box([2 * s for s in size]), False
-    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+    if kind == G.mjGEOM_CYLINDER:
         return mg.Cylinder(2 * size[1], size[0]), True
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+    if kind == G.mjGEOM_CAPSULE:
         return Capsule(size[0], size[1]), True
-    if kind == mujoco.mjtGeom.mjGEOM_PLANE:
+    if kind == G.mjGEOM_PLANE:
         x, y = (s if s > 0 else _INFINITE for s in size[:2])
         corners = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
-        return mg.TriangularMeshGeometry(corners, np.array([[0, 1, 2], [0, 2, 3]])), False
-    raise ValueError(
-        f"{what} is a {kind.name}; drawn are spheres, ellipsoids, boxes, cylinders, capsules, "
-        "planes and meshes"
-    )
+        return Triangles(corners, np.array([[0, 1, 2], [0, 2, 3]])), False
+    raise ValueError(f"{what} is a {kind.name}, which has no counterpart")

@@ -1,4 +1,4 @@
-"""What is drawn over the scene: a trail, a marker that may move, an arrow for a vector."""
+"""What is drawn over the scene: a trail, a marker that may move, an arrow, a word beside a part."""
 
 from __future__ import annotations
 
@@ -58,7 +58,15 @@ class Arrow:
     name: str = ""
 
 
-Overlay = Trail | Marker | Arrow
+@dataclass(frozen=True)
+class Label:
+    """A word beside a point (T, 3), m, of the same size from near and far."""
+
+    name: str
+    points: Array
+
+
+Overlay = Trail | Marker | Arrow | Label
 
 
 def trail(name: str, points: Array) -> Trail:
@@ -80,9 +88,9 @@ def as_overlays(
         marker = given if isinstance(given, Marker) else Marker(name, np.asarray(given))
         free = _MARKER_COLORS[i % len(_MARKER_COLORS)]
         color = free if marker.color is None else marker.color
-        out.append(Marker(name, _rows(name, marker.points, frames), color, marker.radius))
+        out.append(Marker(name, rows_of(name, marker.points, frames), color, marker.radius))
     for name, arrow in arrows.items():
-        points, vectors = (_rows(name, a, frames) for a in (arrow.points, arrow.vectors))
+        points, vectors = (rows_of(name, a, frames) for a in (arrow.points, arrow.vectors))
         if not (np.isfinite(points).all() and np.isfinite(vectors).all()):
             raise ValueError(f"arrow {name!r} must be finite")
         look = (arrow.scale, arrow.radius, arrow.color, arrow.threshold)
@@ -90,7 +98,8 @@ def as_overlays(
     return out
 
 
-def _rows(name: str, array: ArrayLike, frames: int) -> Array:
+def rows_of(name: str, array: ArrayLike, frames: int) -> Array:
+    """An array (3,) or (frames, 3) as (frames, 3); the name is for the error."""
     rows = np.asarray(array, dtype=float)
     if rows.shape not in ((3,), (frames, 3)):
         raise ValueError(f"{name!r} must have shape (3,) or ({frames}, 3), got {rows.shape}")

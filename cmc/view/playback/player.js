@@ -1,27 +1,37 @@
 "use strict";
-// Plays SCENE, which page.py writes: meshcat commands that draw it, packed poses that move it.
+// Plays CONTENT, which page.py writes: scenes of meshcat commands that draw them and packed poses
+// that move them, side by side under one time slider.
 (() => {
 const byId = (id) => document.getElementById(id);
-let viewer;
-try {
-  viewer = new MeshCat.Viewer(byId("pane"));
-} catch (error) {
-  const note = document.createElement("p");
-  note.id = "failure";
-  note.textContent = "This page needs WebGL, which this browser does not offer: " + error.message;
-  document.body.appendChild(note);
-  return;
-}
 const THREE = MeshCat.THREE;
-const resize = viewer.set_3d_pane_size.bind(viewer);
-viewer.set_3d_pane_size = (width, height) => resize(  // the bar below must not hide the scene
-  width, height === undefined ? window.innerHeight - byId("bar").offsetHeight : height);
+const tint = (number) => "#" + number.toString(16).padStart(6, "0");
+const upright = (p) => new THREE.Vector3(p.x, p.z, -p.y);  // the model's z is up, three.js's y
 
 function unpack(text, Type) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   return Type ? new Type(bytes.buffer) : bytes;
 }
-const tint = (number) => "#" + number.toString(16).padStart(6, "0");
+function element(tag, name, parent) {
+  const node = document.createElement(tag);
+  node.className = name;
+  return parent.appendChild(node);
+}
+
+// One scene in its pane: {duration, names, step, seek, look, viewer}.
+function stage(SCENE) {
+const pane = element("div", "pane", byId("panes"));
+const viewer = new MeshCat.Viewer(element("div", "canvas", pane));
+const resize = viewer.set_3d_pane_size.bind(viewer);
+viewer.set_3d_pane_size = (width, height) => resize(  // the bar below must not hide the scene
+  width ?? pane.clientWidth, height ?? window.innerHeight - byId("bar").offsetHeight);
+// A mesh that is used again comes as a stand-in with the first one's uuid.
+const shapes = {}, place = viewer.set_object.bind(viewer);
+viewer.set_object = (path, object) => {
+  object.traverse((part) => {
+    if (part.geometry) part.geometry = shapes[part.geometry.uuid] ??= part.geometry;
+  });
+  place(path, object);
+};
 
 // ---- scene -----------------------------------------------------------------------------------
 for (const command of SCENE.commands) viewer.handle_command_bytearray(unpack(command));
@@ -70,45 +80,11 @@ function aimLights() {
   box.updateProjectionMatrix();
 }
 
-// ---- camera: presets are in the model's coordinates (z up), three.js has y up ------------------
-const upright = (p) => new THREE.Vector3(p[0], p[2], -p[1]);
-let following = null;
-function look(index) {
-  const preset = SCENE.cameras[index];
-  if (!preset) return;
-  viewer.camera.position.copy(upright(preset.position));
-  viewer.controls.target.copy(upright(preset.target));
-  following = trails.find((trail) => trail.name === preset.follow) || null;
-  if (following) following.seen = following.at(0);
-  byId("cameras").querySelectorAll("button").forEach(
-    (b, i) => b.setAttribute("aria-pressed", String(i === index)));
-  seek(now);
-  viewer.controls.update();
-}
-function followTrail(frame, share) {
-  const place = following.at(frame, share), step = place.clone().sub(following.seen);
-  const shift = new THREE.Vector3(step.x, step.z, -step.y);
-  viewer.camera.position.add(shift);
-  viewer.controls.target.add(shift);
-  following.seen = place;
-}
-function fitDepth() {
-  const reach = viewer.camera.position.distanceTo(viewer.controls.target);
-  viewer.camera.near = reach * 0.02;
-  viewer.camera.far = reach * 30 + 20;
-  viewer.scene.fog.near = 3 + reach * 2;
-  viewer.scene.fog.far = 6 + reach * 6;
-  viewer.camera.updateProjectionMatrix();
-  aimLights();
-}
-viewer.camera.fov = SCENE.field_of_view;
-viewer.controls.addEventListener("change", fitDepth);
-
 // ---- overlays --------------------------------------------------------------------------------
 function rowReader(text) {
-  const rows = unpack(text, Float32Array);
+  const rows = unpack(text, Float32Array), end = rows.length / 3 - 1;
   return (frame, share = 0) => {
-    const i = 3 * frame, j = 3 * Math.min(frame + 1, last);
+    const i = 3 * Math.min(frame, end), j = 3 * Math.min(frame + 1, end);
     const a = new THREE.Vector3(rows[i], rows[i + 1], rows[i + 2]);
     return share > 0 ? a.lerp(new THREE.Vector3(rows[j], rows[j + 1], rows[j + 2]), share) : a;
   };
@@ -155,7 +131,7 @@ function makeTrail(item) {
   group.add(new THREE.Mesh(tube, skin));
   group.add(new THREE.Line(line, new THREE.LineBasicMaterial({ color: item.color })));
   group.traverse((part) => { part.frustumCulled = false; });
-  return { name: item.name, at, seen: at(0), update(frame) {
+  return { update(frame) {
     tube.setDrawRange(0, 6 * sides * frame);
     line.setDrawRange(0, frame + 1);
   } };
@@ -190,13 +166,132 @@ function makeArrow(item) {
     head.position.y = length + 3 * item.radius;
   } };
 }
-const makers = { Trail: makeTrail, Marker: makeMarker, Arrow: makeArrow };
+// A word of the same size from near and far, in front of everything.
+function makeLabel(item) {
+  const at = rowReader(item.points), canvas = document.createElement("canvas");
+  const pen = canvas.getContext("2d"), font = "30px system-ui, sans-serif";
+  pen.font = font;
+  canvas.width = Math.ceil(pen.measureText(item.name).width) + 24;
+  canvas.height = 88;  // the word in the upper half, so that the point below it stays free
+  pen.fillStyle = "rgba(255, 255, 255, 0.8)";
+  pen.fillRect(0, 0, canvas.width, 44);
+  pen.font = font;
+  pen.fillStyle = "#1f2933";
+  pen.fillText(item.name, 12, 32);
+  const sprite = named(new THREE.Sprite(new THREE.SpriteMaterial({
+    map: new THREE.CanvasTexture(canvas), sizeAttenuation: false, depthTest: false, fog: false,
+  })), item.name);
+  sprite.renderOrder = 9;
+  return { update(frame, share) {
+    sprite.position.copy(at(frame, share));
+    const size = 0.1 * Math.tan(viewer.camera.fov * Math.PI / 360);
+    sprite.scale.set(size * canvas.width / canvas.height, size, 1);
+  } };
+}
+// Triangles whose corners move: the corners, and what to call when they have.
+function makeSurface(item, count) {
+  const shape = new THREE.BufferGeometry(), corners = new Float32Array(count);
+  shape.setAttribute("position", new THREE.BufferAttribute(corners, 3));
+  shape.setIndex(new THREE.BufferAttribute(unpack(item.faces, Uint32Array), 1));
+  const mesh = named(new THREE.Mesh(shape, new THREE.MeshPhongMaterial({
+    color: item.color, opacity: item.opacity, transparent: item.opacity < 1,
+    side: THREE.DoubleSide, shininess: 20, specular: 0x222222 })), item.name);
+  mesh.castShadow = mesh.receiveShadow = true;
+  mesh.frustumCulled = false;
+  return [corners, () => {
+    shape.attributes.position.needsUpdate = true;
+    shape.computeVertexNormals();
+  }];
+}
+// A skin: each corner is the weighted mean of where its bones alone would take it.
+function makeSkin(item) {
+  const rest = unpack(item.corners, Float32Array);
+  const [corners, done] = makeSurface(item, rest.length);
+  const bones = item.bones.map((bone) => ({
+    object: moving.objects[bone.body], index: unpack(bone.index, Uint32Array),
+    weight: unpack(bone.weight, Float32Array), back: new THREE.Matrix4().compose(
+      new THREE.Vector3(bone.rest[0], bone.rest[1], bone.rest[2]),
+      new THREE.Quaternion(bone.rest[4], bone.rest[5], bone.rest[6], bone.rest[3]),
+      new THREE.Vector3(1, 1, 1)).invert(),
+  }));
+  const turn = new THREE.Matrix4();
+  return { update() {
+    corners.fill(0);
+    for (const { object, index, weight, back } of bones) {
+      object.updateMatrix();
+      const m = turn.multiplyMatrices(object.matrix, back).elements;
+      index.forEach((v, k) => {
+        const w = weight[k], x = rest[3 * v], y = rest[3 * v + 1], z = rest[3 * v + 2];
+        for (let r = 0; r < 3; r++) {
+          corners[3 * v + r] += w * (m[r] * x + m[4 + r] * y + m[8 + r] * z + m[12 + r]);
+        }
+      });
+    }
+    done();
+  } };
+}
+// A cloth or a tendon: corners as shares of a box, 16 bits each.
+function makeCloth(item) {
+  const shares = unpack(item.shares, Uint16Array), width = 3 * item.count;
+  const frames = shares.length / width, [corners, done] = makeSurface(item, width);
+  let shown = -1;
+  return { update(frame, share) {
+    if (shown === frame + share || (frames === 1 && shown >= 0)) return;
+    shown = frame + share;
+    const i = width * Math.min(frame, frames - 1), j = width * Math.min(frame + 1, frames - 1);
+    for (let k = 0; k < width; k++) {
+      const value = shares[i + k] + share * (shares[j + k] - shares[i + k]);
+      corners[k] = item.low[k % 3] + item.side[k % 3] * value / 65535;
+    }
+    done();
+  } };
+}
+const makers = { Trail: makeTrail, Marker: makeMarker, Arrow: makeArrow, Label: makeLabel };
 const overlays = SCENE.overlays.map((item) => makers[item.kind](item));
-const trails = overlays.filter((overlay) => "seen" in overlay);
+overlays.push(...SCENE.cloths.map(makeCloth), ...SCENE.skins.map(makeSkin));
+
+// ---- camera: presets are in the model's coordinates, in rows of one or of all frames -------------
+const presets = SCENE.cameras.map((item) => ({
+  ...item, position: rowReader(item.position), target: rowReader(item.target),
+  up: rowReader(item.up) }));
+let active = null, seen = null;
+const stand = (preset, frame, share) => ["position", "target", "up"].map(
+  (key) => upright(preset[key](frame, share)));
+function look(name) {
+  const preset = presets.find((item) => item.name === name);
+  if (!preset) return;
+  active = preset;
+  seen = stand(preset, ...locate(now));
+  viewer.camera.fov = preset.field_of_view;
+  viewer.camera.position.copy(seen[0]);
+  viewer.controls.target.copy(seen[1]);
+  viewer.camera.up.copy(seen[2]);
+  fitDepth();
+  viewer.controls.update();
+  viewer.set_dirty();
+}
+// The camera goes along with its preset; what the mouse has changed since is kept.
+function carry(frame, share) {
+  const next = stand(active, frame, share);
+  viewer.camera.position.add(next[0].clone().sub(seen[0]));
+  viewer.controls.target.add(next[1].clone().sub(seen[1]));
+  viewer.camera.up.copy(next[2]);
+  seen = next;
+}
+function fitDepth() {
+  const reach = viewer.camera.position.distanceTo(viewer.controls.target);
+  viewer.camera.near = reach * 0.02;
+  viewer.camera.far = reach * 30 + 20;
+  viewer.scene.fog.near = 3 + reach * 2;
+  viewer.scene.fog.far = 6 + reach * 6;
+  viewer.camera.updateProjectionMatrix();
+  aimLights();
+}
+viewer.controls.addEventListener("change", fitDepth);
 
 // ---- time ------------------------------------------------------------------------------------
-let now = 0, playing = false, speed = 1, stamp = null;
 const from = new THREE.Quaternion(), to = new THREE.Quaternion();
+let now = 0;
 
 function locate(t) {
   let low = 0, high = last;
@@ -208,7 +303,6 @@ function locate(t) {
   return [low, (t - (times[low] - start)) / (times[low + 1] - times[low])];
 }
 function seek(t) {
-  if (!Number.isFinite(t)) return;
   now = Math.min(Math.max(t, 0), duration);
   const [frame, share] = locate(now);
   const { objects, poses } = moving, width = 7 * objects.length;
@@ -220,14 +314,50 @@ function seek(t) {
     to.set(poses[j + 4], poses[j + 5], poses[j + 6], poses[j + 3]);
     object.quaternion.copy(share > 0 ? from.slerp(to, share) : from).normalize();
   });
+  if (active) carry(frame, share);
   for (const overlay of overlays) overlay.update(frame, share);
-  if (following) followTrail(frame, share);
-  byId("time").value = now;
-  byId("clock").textContent = now.toFixed(2) + " / " + duration.toFixed(2) + " s";
-  byId("readouts").textContent = SCENE.readouts.map(
+  readouts.textContent = SCENE.readouts.map(
     (r, k) => r.name + "  " + values[k][frame].toPrecision(3)).join("\n");
   fitDepth();
   viewer.set_dirty();
+}
+
+const head = element("div", "head", pane);
+element("h1", "", head).textContent = SCENE.title;
+const key = element("div", "key", head), readouts = element("div", "readouts", head);
+for (const item of SCENE.overlays) {
+  if (item.kind === "Label") continue;
+  const label = element("span", "", key);
+  element("i", "", label).style.background = tint(item.color);
+  label.append(item.name);
+}
+if (presets.length) look(presets[0].name);
+seek(0);
+const frameTime = (step) =>
+  times[Math.min(Math.max(locate(now)[0] + step, 0), last)] - start;
+return { viewer, duration, seek, look, frameTime, names: SCENE.cameras.map((c) => c.name) };
+}
+
+// ---- all scenes together ----------------------------------------------------------------------
+let stages;
+try {
+  stages = CONTENT.scenes.map(stage);
+} catch (error) {
+  console.error(error);
+  const note = element("p", "", document.body);
+  note.id = "failure";
+  note.textContent = "This page needs WebGL, which this browser does not offer: " + error.message;
+  return;
+}
+const duration = Math.max(...stages.map((s) => s.duration));
+let now = 0, playing = false, speed = 1, stamp = null;
+
+function seek(t) {
+  if (!Number.isFinite(t)) return;
+  now = Math.min(Math.max(t, 0), duration);
+  for (const each of stages) each.seek(now);
+  byId("time").value = now;
+  byId("clock").textContent = now.toFixed(2) + " / " + duration.toFixed(2) + " s";
 }
 function setPlaying(on) {
   playing = on && duration > 0;
@@ -248,18 +378,18 @@ function setSpeed(value) {
   const option = [...byId("speed").options].find((o) => Number(o.value) === value);
   if (option) option.selected = true;
 }
+const names = [...new Set(stages.flatMap((s) => s.names))];
+function look(index) {
+  if (!(index in names)) return;
+  for (const each of stages) each.look(names[index]);
+  byId("cameras").querySelectorAll("button").forEach(
+    (b, i) => b.setAttribute("aria-pressed", String(i === index)));
+}
 
 // ---- controls, keys, and messages from a slider beside the frame -------------------------------
-byId("head").querySelector("h1").textContent = SCENE.title;
-for (const item of SCENE.overlays) {
-  const label = document.createElement("span"), dot = document.createElement("i");
-  dot.style.background = tint(item.color);
-  label.append(dot, item.name);
-  byId("key").appendChild(label);
-}
-SCENE.cameras.forEach((camera, i) => {
+names.forEach((name, i) => {
   const button = document.createElement("button");
-  button.textContent = camera.name;
+  button.textContent = name;
   button.onclick = () => look(i);
   byId("cameras").append(button, " ");
 });
@@ -273,25 +403,25 @@ window.addEventListener("keydown", (event) => {
   if (event.key === " ") setPlaying(!playing);
   else if (step) {
     setPlaying(false);
-    seek(times[Math.min(Math.max(locate(now)[0] + step, 0), last)] - start);
+    seek(stages[0].frameTime(step));
   } else if (event.key >= "1" && event.key <= "9") look(Number(event.key) - 1);
   else return;
   event.preventDefault();
 });
 window.addEventListener("message", (event) => {
   const message = event.data;
-  if (!message || message.cmcPlayback !== SCENE.id) return;
+  if (!message || message.cmcPlayback !== CONTENT.id) return;
   if ("seek" in message) { setPlaying(false); seek(Number(message.seek)); }
   if ("play" in message) setPlaying(Boolean(message.play));
   if ("speed" in message) setSpeed(Number(message.speed));
   if ("camera" in message) look(Number(message.camera));
 });
-if (duration === 0) {
+if (duration === 0 || !CONTENT.slider) {
   for (const id of ["play", "time", "clock", "speed"]) byId(id).style.display = "none";
 }
 look(0);
 seek(0);
-if (SCENE.live) viewer.connect("ws://" + location.host + "/socket");
-window.cmcPlayback = { viewer, seek, look, setPlaying, setSpeed,
+if (CONTENT.live) stages[0].viewer.connect("ws://" + location.host + "/socket");
+window.cmcPlayback = { viewer: stages[0].viewer, stages, seek, look, setPlaying, setSpeed,
   state: () => ({ time: now, playing, speed }) };
 })();

@@ -1,133 +1,99 @@
-"""A trajectory of any MuJoCo model as meshcat commands and packed poses, without a server.
+"""A trajectory of any MuJoCo model as a scene that plays.
 
-meshcat talks to a window object; `CommandLog` stands in for it and only keeps what it is sent.
-The scene is drawn once, the poses of moving bodies are stored as float32 world poses per frame,
-and the page (`page.py`) or the live server (`live.py`) takes both from the `Recording`.
+The scene is drawn once; the poses of moving bodies are stored as float32 world poses per frame, and
+what changes its shape (flexes, skins, tendons) as corners per frame. Not drawn: sites without a
+material, lights, skyboxes. What cannot be drawn at all is left out and named in a warning.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import meshcat
 import mujoco
 import numpy as np
-import umsgpack
 from numpy.typing import ArrayLike, NDArray
 
-from cmc.view.playback.cameras import Camera, default_cameras, scene_ball
-from cmc.view.playback.geometry import color, geom_mesh, site_mesh, transform
-from cmc.view.playback.overlays import Arrow, Overlay, as_overlays, trail
-
-if TYPE_CHECKING:
-    from cmc.view.playback.live import LiveView
+from cmc.store import write_atomic
+from cmc.view.playback import notebook
+from cmc.view.playback.cameras import Camera
+from cmc.view.playback.drawing import draw, drawn_bodies
+from cmc.view.playback.live import LiveView
+from cmc.view.playback.motion import Motion
+from cmc.view.playback.overlays import Arrow, Label, Overlay, as_overlays, rows_of, trail
+from cmc.view.playback.page import page
+from cmc.view.playback.scene import Cloth, Scene, Skin, body_paths
+from cmc.view.playback.soft import skins
 
 Array = NDArray[np.float64]
 _STATES = (mujoco.mjtState.mjSTATE_FULLPHYSICS, mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
-class CommandLog:
-    """Stands in for meshcat's window: keeps every command as the bytes meshcat's viewer reads."""
+class Playable:
+    """What can be saved as a page or shown in a notebook."""
 
-    def __init__(self) -> None:
-        self.commands: list[bytes] = []
+    @property
+    def scenes(self) -> tuple[Scene, ...]:
+        """The scenes, from left to right."""
+        raise NotImplementedError
 
-    def send(self, command: Any) -> None:
-        """Keep one meshcat command."""
-        self.commands.append(umsgpack.packb(command.lower()))
-
-
-@dataclass(frozen=True)
-class Recording:
-    """A scene and what moves in it. Made by `record`; saved, shown or served from here.
-
-    Attributes:
-        title: shown above the scene and as the page's title.
-        times: (T,) seconds, increasing.
-        bodies: paths in the scene of the bodies that move.
-        poses: (T, len(bodies), 7) float32 world poses: position in m, quaternion with w first.
-        commands: meshcat commands that draw the scene at the first frame.
-        overlays: trails, markers, arrows.
-        readouts: named values (T,) printed while playing; a unit may follow in the name.
-        cameras: presets by name, the first one is used on opening.
-    """
-
-    title: str
-    times: Array
-    bodies: tuple[str, ...]
-    poses: NDArray[np.float32]
-    commands: tuple[bytes, ...]
-    overlays: tuple[Overlay, ...] = ()
-    readouts: Mapping[str, Array] = field(default_factory=dict)
-    cameras: Mapping[str, Camera] = field(default_factory=dict)
-
-    def html(self) -> str:
-        """The whole page as text: viewer, scene and motion, nothing loaded from elsewhere."""
-        from cmc.view.playback.page import page
-
-        return page(self)
+    def html(self, *, slider: bool = True) -> str:
+        """The whole page as text: viewer, scenes and motion, nothing loaded from elsewhere."""
+        return page(self.scenes, slider=slider)
 
     def save(self, path: str | Path) -> Path:
         """Write the page to `path` (a half-written page never appears) and return the path."""
-        from cmc.store import write_atomic
-
         text = self.html().encode()
         return write_atomic(path, lambda file: file.write(text))
 
-    def show(
-        self, path: str | Path, height: int = 480, slider: Any = None, live: bool = False
-    ) -> Any:
-        """Save to `path` and show the file in a notebook, or, `live`, a page served from here.
+    def show(self, path: str | Path | None = None, height: int = 480, slider: Any = None) -> Any:
+        """The page for a notebook to display: saved to `path`, or embedded without one.
 
-        Returns the slider under the scene, or the `LiveView`; see `notebook.show` and `show_live`.
+        A saved page keeps the notebook small, but needs a server that delivers it (JupyterLab); an
+        embedded one (1 MB more) also appears in VS Code, Colab, voila and exported HTML.
+
+        Args:
+            path: where to save, relative to the notebook.
+            height: height of the frame in pixels.
+            slider: an ipywidgets slider in seconds that moves the scene in place of the page's own.
         """
-        from cmc.view.playback import notebook
+        return notebook.show(self.scenes, path, height=height, slider=slider)
 
-        if live:
-            return notebook.show_live(self, height=height)
-        return notebook.show(self, path, height=height, slider=slider)
+
+@dataclass(frozen=True)
+class Recording(Playable, Scene):
+    """A scene made by `record`; saved, shown or served from here."""
+
+    @property
+    def scenes(self) -> tuple[Scene, ...]:
+        """This scene alone."""
+        return (self,)
 
     def serve(self, timeout: float = 600.0) -> LiveView:
         """Serve the scene live on the loopback interface instead; see `live.LiveView`."""
-        from cmc.view.playback.live import LiveView
-
         return LiveView(self, timeout=timeout)
 
 
-def draw(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[int]) -> CommandLog:
-    """Draw the visible geoms, and sites with a material, of the groups at the pose `data` holds."""
-    log = CommandLog()
-    scene = meshcat.Visualizer(window=log)  # type: ignore[no-untyped-call]
-    for body in drawn_bodies(model, groups):
-        node = scene[body_path(model, body)]
-        node.set_transform(transform(data.xpos[body], data.xquat[body]))
-        for geom in _visible_geoms(model, body, groups):
-            mesh, local = geom_mesh(model, geom)
-            node[f"geom{geom}"].set_object(mesh)
-            node[f"geom{geom}"].set_transform(local)
-        for site in _visible_sites(model, body, groups):
-            mesh, local = site_mesh(model, site)
-            node[f"site{site}"].set_object(mesh)
-            node[f"site{site}"].set_transform(local)
-    return log
+@dataclass(frozen=True)
+class Beside(Playable):
+    """Scenes side by side under one time slider, such as a success beside a failure."""
+
+    recordings: tuple[Scene, ...]
+
+    @property
+    def scenes(self) -> tuple[Scene, ...]:
+        """The scenes, from left to right."""
+        return self.recordings
 
 
-def drawn_bodies(model: mujoco.MjModel, groups: Sequence[int]) -> list[int]:
-    """Bodies that own at least one visible geom or site."""
-    return [
-        b
-        for b in range(model.nbody)
-        if _visible_geoms(model, b, groups) or _visible_sites(model, b, groups)
-    ]
-
-
-def body_path(model: mujoco.MjModel, body: int) -> str:
-    """Name of a body in the scene: its own, without slashes, or its number."""
-    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body)
-    return name.replace("/", "|") if name else f"body{body}"
+def beside(*recordings: Scene) -> Beside:
+    """Show recordings side by side: one time slider, and cameras of the same name together."""
+    if not recordings:
+        raise ValueError("wanted at least one recording, got none")
+    return Beside(recordings)
 
 
 def record(
@@ -139,10 +105,12 @@ def record(
     trails: Sequence[str] = (),
     markers: Mapping[str, ArrayLike] | None = None,
     arrows: Mapping[str, Arrow] | None = None,
+    labels: Mapping[str, str | ArrayLike] | None = None,
     readouts: Mapping[str, ArrayLike] | None = None,
     cameras: Mapping[str, Camera] | None = None,
     mocap: tuple[ArrayLike, ArrayLike] | None = None,
     groups: Sequence[int] = (0, 1, 2),
+    tail: float | None = None,
 ) -> Recording:
     """Record a motion of a MuJoCo model.
 
@@ -155,87 +123,102 @@ def record(
         trails: sites or bodies that leave a trail.
         markers: points to show, (3,) or (T, 3) in m; a row of NaN hides the marker.
         arrows: vectors to show, for example a contact force.
+        labels: word to the site or body that it stands beside, or to a point (3,) or (T, 3), m.
         readouts: values (T,) printed beside the scene, such as {"force [N]": f}.
-        cameras: presets; left out, they frame the scene and, if there is a trail, its end.
+        cameras: presets; left out, they frame what moves and the scene, and are the model's own.
         mocap: positions (T, nmocap, 3) and quaternions (T, nmocap, 4) of mocap bodies, where the
             states do not hold them.
-        groups: geom and site groups that are drawn; of the sites, those with a material.
+        groups: geom, site, tendon, flex and skin groups that are drawn.
+        tail: seconds kept after the last motion; everything is kept by default.
 
     Raises:
         ValueError: for states, times or overlays of the wrong shape, not finite, or out of order,
-            and for trails that name no site or body.
+            and for trails, labels or cameras that name no site or body.
     """
     time, rows, spec = _checked(model, states, times)
+    motion = Motion(model, rows, spec, mocap, groups)
+    tracks = {name: motion.point(name) for name in trails}
     drawn = drawn_bodies(model, groups)
-    points = [_locator(model, name) for name in trails]
-    data = mujoco.MjData(model)
-    poses, sites = _replay(model, data, rows, spec, mocap)
-    tracks = {
-        name: sites[:, index] if is_site else poses[:, index, :3].astype(float)
-        for name, (is_site, index) in zip(trails, points, strict=True)
+    worn = skins(model, groups)
+    bones = {bone.body for skin in worn for bone in skin.bones}
+    known = sorted({*drawn, *bones})
+    moving = [b for b in known if b in bones or np.ptp(motion.poses[:, b], axis=0).max() > 0.0]
+    presets = cameras or motion.cameras(moving, groups, tracks)
+    presets = {
+        name: camera.along(tracks.get(camera.follow, motion.point(camera.follow)))
+        if camera.follow
+        else camera
+        for name, camera in presets.items()
     }
-    poses = poses[:, drawn]
-    moving = np.flatnonzero(np.ptp(poses, axis=0).max(axis=-1) > 0.0)
-    over = as_overlays(len(time), markers or {}, arrows or {})
-    return Recording(
+    words = {
+        word: motion.point(at) if isinstance(at, str) else rows_of(word, at, len(time))
+        for word, at in (labels or {}).items()
+    }
+    over: list[Overlay] = [trail(name, track) for name, track in tracks.items()]
+    over += as_overlays(len(time), markers or {}, arrows or {})
+    over += [Label(word, points) for word, points in words.items()]
+    paths = body_paths(model)
+    whole = Recording(
         title=title,
         times=time,
-        bodies=tuple(body_path(model, drawn[i]) for i in moving),
-        poses=np.ascontiguousarray(poses[:, moving]),
-        commands=tuple(draw(model, data, groups).commands),
-        overlays=(*(trail(name, track) for name, track in tracks.items()), *over),
+        bodies=tuple(paths[b] for b in moving),
+        poses=np.ascontiguousarray(motion.poses[:, moving]),
+        commands=tuple(draw(model, motion.data, groups).commands),
+        cloths=motion.cloths,
+        skins=tuple(_with_bodies(skin, moving) for skin in worn),
+        overlays=tuple(over),
         readouts={name: _values(name, v, len(time)) for name, v in (readouts or {}).items()},
-        cameras=dict(cameras or default_cameras(model, data, _ball(model, data, groups), tracks)),
+        cameras=presets,
     )
+    if not (drawn or whole.cloths or worn):
+        there = sorted(set(map(int, model.geom_group)))
+        warnings.warn(f"nothing of groups {tuple(groups)} is seen; geoms: {there}", stacklevel=2)
+    return whole if tail is None else _until_rest(whole, tail)
 
 
-def _replay(
-    model: mujoco.MjModel, data: mujoco.MjData, rows: Array, spec: int | None, mocap: Any
-) -> tuple[NDArray[np.float32], Array]:
-    """World poses (T, nbody, 7) and site positions (T, nsite, 3); `data` is left at frame 0."""
-    poses = np.empty((len(rows), model.nbody, 7), dtype=np.float32)
-    sites = np.empty((len(rows), model.nsite, 3))
-    qpos, xpos, xquat, site_xpos = data.qpos, data.xpos, data.xquat, data.site_xpos  # live views
-    for k in range(len(rows) - 1, -1, -1):
-        if spec is None:
-            qpos[:] = rows[k]
-        else:
-            mujoco.mj_setState(model, data, rows[k], spec)
-        if mocap is not None:
-            data.mocap_pos[:], data.mocap_quat[:] = mocap[0][k], mocap[1][k]
-        mujoco.mj_kinematics(model, data)
-        poses[k, :, :3], poses[k, :, 3:], sites[k] = xpos, xquat, site_xpos
-    return poses, sites
+def _with_bodies(skin: Skin, moving: Sequence[int]) -> Skin:
+    """The skin with bones that count in the bodies whose poses are stored."""
+    bones = tuple(replace(bone, body=moving.index(bone.body)) for bone in skin.bones)
+    return replace(skin, bones=bones)
 
 
-def _ball(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[int]) -> tuple[Array, float]:
-    geoms = [g for b in range(model.nbody) for g in _visible_geoms(model, b, groups)]
-    return scene_ball(model, data, geoms)
+def _until_rest(whole: Recording, tail: float) -> Recording:
+    """The recording up to `tail` seconds after the last frame away from the final poses.
+
+    Away is farther than a hundredth of the largest distance (in m, and turns in rad / 10).
+    """
+    apart = np.abs(whole.poses - whole.poses[-1]) * [1, 1, 1, 0.2, 0.2, 0.2, 0.2]
+    away = apart.reshape(len(apart), -1).max(axis=1, initial=0.0)
+    moved = np.flatnonzero(away > 0.01 * away.max())
+    end = whole.times[moved[-1]] + tail if len(moved) else whole.times[0] + tail
+    return cut(whole, int(np.searchsorted(whole.times, end, side="right")))
 
 
-def _visible_geoms(model: mujoco.MjModel, body: int, groups: Sequence[int]) -> list[int]:
-    first = model.body_geomadr[body]
-    return [
-        g
-        for g in range(first, first + model.body_geomnum[body])
-        if model.geom_group[g] in groups and color(model, g)[3] > 0.0
-    ]
+def cut(whole: Recording, frames: int) -> Recording:
+    """The first `frames` frames of a recording."""
+    count = len(whole.times)
 
+    def rows(array: Any) -> Any:
+        return array[:frames] if np.ndim(array) == 2 and len(array) == count else array
 
-def _visible_sites(model: mujoco.MjModel, body: int, groups: Sequence[int]) -> list[int]:
-    shown = (
-        (model.site_bodyid == body) & (model.site_matid >= 0) & np.isin(model.site_group, groups)
+    cameras = {
+        n: Camera(rows(c.position), rows(c.target), c.follow, rows(c.up), c.field_of_view)
+        for n, c in whole.cameras.items()
+    }
+    cloths = [Cloth(c.name, c.faces, c.rgba, c.corners[:frames]) for c in whole.cloths]
+    overlays = [type(o)(**{k: rows(v) for k, v in vars(o).items()}) for o in whole.overlays]
+    return Recording(
+        title=whole.title,
+        times=whole.times[:frames],
+        bodies=whole.bodies,
+        poses=whole.poses[:frames],
+        commands=whole.commands,
+        cloths=tuple(cloths),
+        skins=whole.skins,
+        overlays=tuple(overlays),
+        readouts={name: v[:frames] for name, v in whole.readouts.items()},
+        cameras=cameras,
     )
-    return [int(site) for site in np.flatnonzero(shown)]
-
-
-def _locator(model: mujoco.MjModel, name: str) -> tuple[bool, int]:
-    """Whether `name` is a site (else a body), and its index."""
-    for is_site, kind in ((True, mujoco.mjtObj.mjOBJ_SITE), (False, mujoco.mjtObj.mjOBJ_BODY)):
-        index = mujoco.mj_name2id(model, kind, name)
-        if index >= 0:
-            return is_site, index
-    raise ValueError(f"the model has no site and no body named {name!r}")
 
 
 def _checked(
