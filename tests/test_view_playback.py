@@ -369,6 +369,28 @@ def test_height_fields_lie_where_mujoco_has_them():
     assert record(model, np.zeros((1, 0)), [0.0]).commands
 
 
+@pytest.mark.parametrize(
+    ("size", "repeat", "uniform", "wanted"),
+    [
+        ("1 .5 .1", "1 1", "false", [0.525, 0.45]),
+        ("1 .5 .1", "2 1", "false", [1.05, 0.45]),
+        ("1 .5 .1", "1 1", "true", [0.525, 0.225]),
+        ("0 0 .1", "2 1", "true", [0.55, 0.475]),
+    ],
+)
+def test_textures_of_planes_lie_as_mujoco_draws_them(size, repeat, uniform, wanted):
+    """Texture coordinates at (0.05, 0.05) m, read from pictures of MuJoCo's renderer."""
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><asset><texture name="t" type="2d" builtin="flat" width="8" height="8"/>
+        <material name="m" texture="t" texrepeat="{repeat}" texuniform="{uniform}"/></asset>
+        <worldbody><geom type="plane" size="{size}" material="m"/></worldbody></mujoco>"""
+    )
+    plane = geom_mesh(model, 0)[0].geometry
+    slope = (plane.uv[2] - plane.uv[0]) / (plane.vertices[2] - plane.vertices[0])[:2]
+    found = plane.uv[0] + slope * (np.array([0.05, 0.05]) - plane.vertices[0, :2])
+    np.testing.assert_allclose(found, wanted, atol=5e-5)
+
+
 def test_what_cannot_be_drawn_is_named_and_the_rest_is_drawn(model, monkeypatch):
     qpos, _, times = tumble(model, frames=2)
 

@@ -7,12 +7,12 @@ capsules built here) have their axis along y, MuJoCo's along z: both are turned 
 
 from __future__ import annotations
 
-import io
-
 import mujoco
 import numpy as np
 from meshcat import geometry as mg
 from numpy.typing import NDArray
+
+from cmc.view.playback.textures import box_triangles, cube_uv, flat_uv, png, texture
 
 Array = NDArray[np.float64]
 Rgba = tuple[float, float, float, float]
@@ -21,7 +21,6 @@ G = mujoco.mjtGeom
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 _DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
 _INFINITE = 60.0  # half-size in metres at which a plane without bounds is drawn
-_LARGEST = 512  # pixels across a texture; larger ones are made smaller
 _TRIANGLES = (G.mjGEOM_MESH, G.mjGEOM_SDF)
 
 
@@ -145,24 +144,11 @@ def shown_rgba(model: mujoco.MjModel, rgba: Array, material: int) -> Rgba:
     """The own color, or the material's where that is the default, times the texture's mean."""
     rgba = own_rgba(model, rgba, material)
     pixels = texture(model, material)
-    mean = np.ones(3) if pixels is None else pixels.reshape(-1, pixels.shape[-1]).mean(axis=0) / 255
-    r, g, b = (float(c) for c in np.clip(rgba[:3] * np.resize(mean, 4)[:3], 0.0, 1.0))
-    return r, g, b, float(np.clip(rgba[3], 0.0, 1.0))
-
-
-def texture(model: mujoco.MjModel, material: int) -> NDArray[np.uint8] | None:
-    """Pixels (rows, columns, 3) of a material's color texture, or None."""
-    if material < 0:
-        return None
-    roles = (mujoco.mjtTextureRole.mjTEXROLE_RGB, mujoco.mjtTextureRole.mjTEXROLE_RGBA)
-    index = max(int(model.mat_texid[material, int(role)]) for role in roles)
-    if index < 0:
-        return None
-    rows, columns = int(model.tex_height[index]), int(model.tex_width[index])
-    channels, first = int(model.tex_nchannel[index]), int(model.tex_adr[index])
-    pixels = model.tex_data[first : first + rows * columns * channels]
-    pixels = pixels.reshape(rows, columns, channels)
-    return np.repeat(pixels, 3, axis=-1)[..., :3] if channels < 3 else pixels[..., :3]
+    if pixels is not None:
+        step = max(1, pixels.shape[1] // 128)
+        rgba = rgba * [*(pixels[::step, ::step].mean(axis=(0, 1)) / 255), 1]
+    r, g, b, a = (float(c) for c in np.clip(rgba, 0.0, 1.0))
+    return r, g, b, a
 
 
 def _textured(
@@ -173,21 +159,26 @@ def _textured(
     if pixels is None:
         return None, False
     repeat, uniform = model.mat_texrepeat[material], bool(model.mat_texuniform[material])
-    if kind == G.mjGEOM_PLANE and len(pixels) < 2 * pixels.shape[1]:
+    square = len(pixels) // pixels.shape[1]
+    if kind == G.mjGEOM_PLANE and square < 6:
         half = np.where(size[:2] > 0, size[:2], _INFINITE)
-        # "uniform" in MuJoCo: `repeat` times in two metres
-        per_metre = repeat / 2 if uniform or not size[:2].all() else repeat / (2 * half)
-        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
-        uv = corners * per_metre * [1, -1] + 0.5
-        return Triangles(np.c_[corners, np.zeros(4)], np.array([[0, 1, 2], [0, 2, 3]]), uv), True
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        uv = flat_uv(corners, size[:2], repeat, uniform, _INFINITE)
+        vertices = np.c_[corners * half, np.zeros(4)]
+        return Triangles(vertices, np.array([[0, 1, 2], [0, 2, 3]]), uv), True
     if kind == G.mjGEOM_HFIELD:
         surface = _height_field(model, dataid)
-        share = surface.vertices[:, :2] / model.hfield_size[dataid, :2] * [1, -1]
-        size_ = model.hfield_size[dataid, :2] if uniform else 1.0
-        surface.uv = share * size_ * repeat / 2 + 0.5
+        half = model.hfield_size[dataid, :2]
+        surface.uv = flat_uv(surface.vertices[:, :2] / half, 0 * half, repeat, True, half)
+        if not uniform:
+            surface.uv = (surface.uv - 0.5) / half + 0.5
         return surface, True
     if kind == G.mjGEOM_BOX:
-        return _textured_box(size, pixels, repeat * size[:2] if uniform else repeat), True
+        vertices, faces = box_triangles()
+        if square == 6:
+            return Triangles(vertices * size, faces, cube_uv(vertices)), True
+        uv = flat_uv(vertices[:, :2], size[:2], repeat, uniform, _INFINITE)
+        return Triangles(vertices * size, faces, uv), True
     if kind == G.mjGEOM_MESH and model.mesh_texcoordnum[dataid] > 0:
         vertices, faces, uv_faces = _mesh_arrays(model, dataid)
         first = model.mesh_texcoordadr[dataid]
@@ -199,29 +190,6 @@ def _textured(
     return None, False
 
 
-def _textured_box(size: Array, pixels: NDArray[np.uint8], repeat: Array) -> Triangles:
-    """A box; a cube's texture holds one square a face below each other: x, -x, y, -y, z, -z."""
-    squares = max(1, len(pixels) // pixels.shape[1])
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    vertices, faces, uv = [], [], []
-    for face in range(6):
-        axis, sign = face // 2, 1 - 2 * (face % 2)
-        points = np.empty((4, 3))
-        points[:, axis] = sign
-        points[:, [k for k in range(3) if k != axis]] = corners
-        x, y, z = points.T
-        if squares == 6:  # OpenGL's cube map: which coordinate runs along a row, which down
-            s, t = ((-sign * z, -y), (x, sign * z), (sign * x, -y))[axis]
-            uv.append(np.stack([(s + 1) / 2, (face + (t * 0.998 + 1) / 2) / 6], axis=1))
-        else:
-            uv.append(np.stack([x, -y], axis=1) * repeat / 2 + 0.5)
-        outwards = np.cross(points[1] - points[0], points[2] - points[0])[axis] * sign > 0
-        order = np.array([[0, 1, 2], [0, 2, 3]] if outwards else [[0, 2, 1], [0, 3, 2]])
-        vertices.append(points * size)
-        faces.append(order + 4 * face)
-    return Triangles(np.concatenate(vertices), np.concatenate(faces), np.concatenate(uv))
-
-
 def _dressed(
     model: mujoco.MjModel, geometry: mg.Geometry, kind: mujoco.mjtGeom, rgba: Rgba, material: int
 ) -> mg.Mesh:
@@ -230,7 +198,7 @@ def _dressed(
     image, (r, g, b, a) = None, rgba
     if material >= 0:
         r, g, b = (float(c) for c in model.mat_rgba[material, :3])
-        image = mg.ImageTexture(mg.PngImage(_png(texture(model, material))), wrap=[1000, 1000])
+        image = mg.ImageTexture(mg.PngImage(png(model, material)), wrap=[1000, 1000])
     dressed = mg.MeshPhongMaterial(
         color=(round(255 * r) << 16) + (round(255 * g) << 8) + round(255 * b),
         map=image,
@@ -241,8 +209,8 @@ def _dressed(
         flatShading=kind in _TRIANGLES or kind == G.mjGEOM_BOX,
         depthWrite=a == 1.0,  # what lies behind a see-through wall is seen from every side
         polygonOffset=plane,  # lines drawn on a floor stay visible
-        polygonOffsetFactor=1,
-        polygonOffsetUnits=1,
+        polygonOffsetFactor=0,
+        polygonOffsetUnits=4,
     )
     return mg.Mesh(geometry, dressed)
 
@@ -254,18 +222,6 @@ def _name(mesh: mg.Mesh, name: str) -> None:
         parts |= {"map": mesh.material.map, "image": mesh.material.map.image}
     for part, element in parts.items():
         element.uuid = f"{part} {name}"
-
-
-def _png(pixels: NDArray[np.uint8] | None) -> bytes:
-    from PIL import Image
-
-    assert pixels is not None
-
-    image, stream = Image.fromarray(np.ascontiguousarray(pixels[::-1])), io.BytesIO()
-    share = min(1.0, _LARGEST / image.width)
-    image = image.resize((max(1, round(image.width * share)), max(1, round(image.height * share))))
-    image.save(stream, "PNG")
-    return stream.getvalue()
 
 
 def _mesh_arrays(

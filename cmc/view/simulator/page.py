@@ -19,8 +19,9 @@ import mujoco
 import numpy as np
 
 from cmc.store import asset, write_atomic
+from cmc.view.playback.drawing import draw, drawn_bodies
 from cmc.view.playback.page import viewer_source
-from cmc.view.playback.recorder import body_path, draw, drawn_bodies
+from cmc.view.playback.scene import body_paths
 
 GROUPS = (0, 1, 2)
 
@@ -60,6 +61,7 @@ def live_page(
     model = mujoco.MjModel.from_xml_string(task["xml"])
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    paths = body_paths(model)
     goal = np.array(task["starts"][0]["goal"])
     view = camera or {"position": (goal + [0.06, -0.09, 0.06]).tolist(), "target": goal.tolist()}
     content = {
@@ -72,7 +74,7 @@ def live_page(
         "camera": view,
         "ball": 0.0012,
         "commands": [_text(command) for command in draw(model, data, GROUPS).commands],
-        "bodies": [{"path": body_path(model, b), "id": b} for b in drawn_bodies(model, GROUPS)],
+        "bodies": [{"path": paths[b], "id": b} for b in drawn_bodies(model, GROUPS)],
     }
     parts = {
         "TITLE": html.escape(title),
