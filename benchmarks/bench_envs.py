@@ -91,7 +91,7 @@ def _plan(ticks: int = 300) -> dict[str, str | float]:
         u = np.tanh(5.0 * (y + integral))
         obs = task.step(u)[0]
         moves.append((goal if k % PUSH.horizon == 0 else None, u))
-        torques.append(task.worlds.data.ctrl.copy())  # type: ignore[attr-defined]
+        torques.append(task.worlds.data[0].ctrl.copy())
     model, data = task.worlds.model, mujoco.MjData(task.worlds.model)
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
 

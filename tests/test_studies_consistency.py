@@ -2,112 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import pytest
 from test_studies_two_level import small
 
 from cmc import store
-from cmc.envs.panda_task import PandaTask
-from cmc.envs.peg_maze import SOFT, STIFF, PegMaze
-from cmc.envs.peg_push import PUSH, PegPush
 from cmc.learning.low_level import Fixed
 from cmc.studies import peg_maze, peg_push, two_level_evaluation, two_level_results
 from cmc.studies.two_level_evaluation import Episodes, consistency, run_episodes, summary
 from cmc.studies.two_level_training import train
-
-FORCES = np.array([[2.0, 0, 0], [0, -1.0, 0.5], [0.3, 0.4, -1.2]])
-
-
-def _free(config, **changes):
-    return replace(config, scene="panda.xml", start_joints=0.0, start_box=(0.0,) * 3, **changes)
-
-
-def _push(task: PandaTask, force: np.ndarray, ticks: int) -> None:
-    """Ticks under a force, in joint space with no stiffness: nothing but gravity is carried."""
-    for _ in range(ticks):
-        task.worlds.push(force)
-        task.worlds.tick_joint(task.worlds.qpos[:, :7], 0.0, np.zeros((task.num, 7)))
-
-
-@pytest.mark.parametrize("peg", [STIFF, SOFT, PUSH], ids=["stiff", "soft", "push"])
-@pytest.mark.parametrize("num", [1, 3])
-def test_a_pushed_arm_moves_as_the_engine_says_for_a_generalized_force(num: int, peg) -> None:
-    config = _free(peg, hold=False)
-    task = PegMaze(config, num, seed=0)
-    model, data = task.worlds.model, mujoco.MjData(task.worlds.model)
-    hand, site = model.body("hand").id, model.site("tip_nominal").id
-    _push(task, FORCES[:num], ticks=10)
-    for k in range(num):
-        mujoco.mj_resetData(model, data)
-        data.qpos[:7] = task._q_start
-        for _ in range(100):
-            mujoco.mj_step1(model, data)
-            data.ctrl[:], data.qfrc_applied[:] = data.qfrc_bias[:7], 0.0
-            tip = data.site_xpos[site]
-            mujoco.mj_applyFT(model, data, FORCES[k], np.zeros(3), tip, hand, data.qfrc_applied)
-            mujoco.mj_step2(model, data)
-        mujoco.mj_step1(model, data)
-        moved = np.linalg.norm(data.site_xpos[site] - np.array(config.start))
-        assert moved > 1e-3
-        np.testing.assert_allclose(task.worlds.nominal[k], data.site_xpos[site], atol=1e-3 * moved)
-
-
-@pytest.mark.parametrize("num", [1, 3])
-def test_a_held_arm_gives_way_by_the_force_over_stiffness_and_effective_mass(num: int) -> None:
-    task = PegPush(_free(PUSH, workspace_low=(-1.0,) * 3, workspace_high=(1.0,) * 3), num, seed=0)
-    task.reset()
-    for _ in range(600):
-        task.worlds.push(0.1 * FORCES[:num])
-        task.step(np.zeros((num, 6)))
-    assert np.abs(task.worlds.signals[:, 6:]).max() < 1e-4
-    data = mujoco.MjData(task.worlds.model)
-    for k in range(num):
-        data.qpos[:] = task.worlds.qpos[k]
-        mujoco.mj_forward(task.worlds.model, data)
-        jac, solved = np.zeros((6, 7)), np.zeros((6, 7))
-        site = task.worlds.model.site("tip_nominal").id
-        mujoco.mj_jacSite(task.worlds.model, data, jac[:3], jac[3:], site)
-        mujoco.mj_solveM(task.worlds.model, data, solved, jac)
-        # At rest K_p e + J M^-1 J^T F = 0: the acceleration that the force alone would cause.
-        expected = -(solved @ jac.T)[:, :3] @ (0.1 * FORCES[k]) / PUSH.gains.kp
-        np.testing.assert_allclose(task.worlds.signals[k, :6], expected, rtol=0.01, atol=2e-5)
-
-
-@pytest.mark.parametrize("num", [1, 2])
-def test_a_push_ends_with_a_reset_and_travels_in_a_snapshot(num: int) -> None:
-    task, quiet = (PegPush(_free(PUSH), num, seed=0) for _ in range(2))
-    force, still = FORCES[:num], np.zeros((num, 6))
-    for t in (task, quiet):
-        t.reset()
-    task.worlds.push(force)
-    kept = task.snapshot()
-    task.step(still)
-    ends = [task.worlds.qpos.copy()]
-    task.worlds.push(np.zeros((num, 3)))
-    task.restore(kept)
-    task.step(still)
-    ends.append(task.worlds.qpos.copy())
-    quiet.step(still)
-    np.testing.assert_array_equal(*ends)
-    assert np.abs(ends[0] - quiet.worlds.qpos).max() > 1e-6
-    for t in (task, quiet):
-        t.seed(3)
-        t.reset()
-        t.step(still)
-    np.testing.assert_array_equal(task.worlds.qpos, quiet.worlds.qpos)
-
-
-@pytest.mark.parametrize("num", [1, 2])
-def test_a_push_of_wrong_shape_or_not_finite_is_refused(num: int) -> None:
-    worlds = PegPush(_free(PUSH), num, seed=0).worlds
-    with pytest.raises(ValueError, match=rf"push: wanted shape \({num}, 3\), got \(3,\)"):
-        worlds.push(np.zeros(3))
-    with pytest.raises(ValueError, match="push: wanted finite numbers"):
-        worlds.push(np.full((num, 3), np.nan))
 
 
 class Linear(Fixed):

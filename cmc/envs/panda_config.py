@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
+from cmc.robot.osc import ControlLaw, Gains
 from cmc.robot.panda import JOINTS, Peg
-from cmc.robot.task_space import ControlLaw, Gains
 
 
 @dataclass(frozen=True)

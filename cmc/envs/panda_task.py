@@ -6,9 +6,7 @@ A tick lasts 20 ms. The low level acts at every tick; the high level sets a sub-
 
 from __future__ import annotations
 
-import functools
 import math
-import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -18,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cmc.envs.panda_config import PandaTaskConfig
-from cmc.envs.worlds import Worlds, make_worlds, pose_quat
+from cmc.envs.panda_observation import FIXED, STATE, measure, observation_layout
+from cmc.envs.worlds import Worlds, pose_quat
 from cmc.robot.panda import FINGERTIP, JOINTS, LOWER, UPPER, inverse_kinematics, load_scene
 
 Array = NDArray[np.float64]
@@ -52,52 +51,49 @@ class PandaTask:
         high_level: names of the fields a planner sees.
     """
 
+    sliders = 0
+    """Joints of the scene after the arm's that are observed as well."""
+    near, box = np.inf, (np.inf, np.inf, np.inf)
+    """Success is a tip nearer to the goal than `near`, m, and within `box`, m, along each axis."""
+
     def __init__(
         self, config: PandaTaskConfig, num: int = 1, seed: int | None = None, threads: int = 1
     ) -> None:
-        self.config, self.num = config, num
-        tool = FINGERTIP + config.peg.length
-        self._q_start = inverse_kinematics(config.start, tool=tool)
-        law = replace(config.law, posture=tuple(self._q_start))
-        substeps = round(config.tick / config.timestep)
-        self.worlds: Worlds = make_worlds(
-            self._scene(substeps), config.gains, law, substeps, config.hold, num, threads
+        self.config, self.num, self.threads = config, num, threads
+        c, joint = config, config.command == "joint"
+        self._q_start = inverse_kinematics(c.start, tool=FINGERTIP + c.peg.length)
+        law = replace(c.law, posture=tuple(self._q_start))
+        substeps = round(c.tick / c.timestep)
+        scene, stiffness = self._scene(substeps), c.joint_stiffness if joint else None
+        self.worlds = Worlds(
+            scene, c.gains, law, substeps, c.hold, num, threads, c.u_limit, stiffness
         )
+        self.target, self.target_joints = self.worlds.target, self.worlds.target_joints
         self.seed(seed)
-        latent = config.gains.latent
-        # mapping_pos: y = K1 e + K2 e', with e' = -velocity because a sub-goal is at rest
-        self._to_latent = np.vstack([np.diag(latent.K1), -np.diag(latent.K2)])
-        self._sum = np.repeat([config.tick, 0.0], 3)  # the integral acts on translation only
-        self._u_limit = np.array(config.u_limit)
-        self._action = np.zeros((num, config.low_size))
-        self._high_low, self._high_high = (
-            np.array(config.subgoal_low),
-            np.array(config.subgoal_high),
-        )
-        self._space_low, self._space_high = map(
-            np.array, (config.workspace_low, config.workspace_high)
-        )
-        if config.command == "joint":
-            self._space_low = np.maximum(self._q_start + self._space_low, LOWER)
-            self._space_high = np.minimum(self._q_start + self._space_high, UPPER)
-        self._aims = np.zeros((2, num, 3))
-        self._goal, self.target = self._aims
-        self._target_quat = np.zeros((num, 4))
-        self.target_rotation, self.target_joints = np.zeros((num, 3)), np.zeros((num, JOINTS))
-        self._ticks, self._one = np.zeros(num, dtype=int), np.ones(num, dtype=int)
-        self._tick = np.full(num, config.tick)
-        self.layout, self.observation_size = _slices({**self._fields(), "time_to_go": 1})
-        self.high_level = (*HIGH_LEVEL, *self._own_fields())
-        self._obs = np.zeros((num, self.observation_size))
-        self._views = {name: self._obs[:, part] for name, part in self.layout.items()}
-        # These live in the observation itself.
-        self._left = self._views["time_to_go"][:, 0]
-        self._integral = self._views.get("integral", np.zeros((num, 6)))
-        self._everyone, self._nobody = np.ones(num, dtype=bool), np.zeros(num, dtype=bool)
-        self._vectors = np.zeros((5, num, 3))
-        pose = config.command == "pose"
-        self._tracked = ("translation", "rotation") if pose else ("joints",)
+        self._high = np.array([c.subgoal_low, c.subgoal_high])
+        self._space = np.array([c.workspace_low, c.workspace_high])
+        if joint:
+            self._space = np.clip(self._q_start + self._space, LOWER, UPPER)
+        self._state = np.zeros(num, STATE)
+        self._goal, self._left = self._state["goal"], self._state["left"]
+        self._ticks, self.target_rotation = self._state["ticks"], np.zeros((num, 3))
+        self.layout = observation_layout(joint, self.sliders)
+        self.observation_size = self.layout["time_to_go"].stop
+        self.high_level = (*HIGH_LEVEL, *(("sliders", "slider_velocity") if self.sliders else ()))
+        self._shape, self._pose = (num, c.low_size), not joint
+        fixed = (joint, self.sliders, scene.nq - self.sliders, c.tick, c.ticks, self.near, self.box)
+        self._fixed = np.array([fixed], FIXED)
         self.reset()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies and pickles are built anew and put into the same state."""
+        force = self.worlds.force.copy(), self.worlds.peaks.copy()
+        parts = (type(self), self.config, self.num, self.threads)
+        return _rebuild, parts, (self.snapshot(), force)
+
+    def __setstate__(self, state: tuple[dict[str, Any], tuple[Array, Array]]) -> None:
+        self.restore(state[0])
+        self.worlds.force[:], self.worlds.peaks[:] = state[1]
 
     # -- what a task defines -------------------------------------------------------------------
 
@@ -106,21 +102,11 @@ class PandaTask:
         c = self.config
         return load_scene(c.scene, c.peg, c.timestep, history=history)
 
-    def _own_fields(self) -> dict[str, int]:
-        """Further observation fields and their sizes."""
-        return {}
-
-    def _observe_own(self, views: Mapping[str, Array]) -> None:
-        """Write the further fields."""
-
     def _draw_goal(self, rng: np.random.Generator) -> Array:
         raise NotImplementedError
 
-    def _rewards(self, distance: Array, tilt: Array) -> dict[str, Array]:
-        """Named terms (N,) from the tip's distance to the goal and its tilt."""
-        raise NotImplementedError
-
-    def _success(self, distance: Array) -> Mask:
+    def _reward(self, distance: Array, tilt: Array) -> tuple[Array, dict[str, Array]]:
+        """Reward (N,) and its named terms, from the tip's distance to the goal and its tilt."""
         raise NotImplementedError
 
     # -- episodes ------------------------------------------------------------------------------
@@ -137,17 +123,17 @@ class PandaTask:
 
     def reset(self, mask: Mask | None = None) -> Array:
         """Start new episodes in the masked worlds (all by default); observations (N, size)."""
-        mask = self._everyone if mask is None else self._checked_mask(mask)
-        qpos = np.zeros((self.num, self.worlds.model.nq))
+        mask, worlds = self._mask(mask), self.worlds
+        qpos = np.zeros((self.num, worlds.model.nq))
         for k in np.flatnonzero(mask):
             qpos[k, :JOINTS] = self._draw_start(self.streams[k])
             self._goal[k] = self._draw_goal(self.streams[k])
-        self.worlds.reset(qpos, mask)
+        worlds.reset(qpos, mask)
         self._ticks[mask], self._left[mask] = 0, 0.0
         if self.config.command == "pose":
-            self._aim(self.worlds.nominal, self.worlds.rotation(), mask)
-        self.target_joints[mask] = self.worlds.qpos[mask, :JOINTS]
-        return self._observe(mask)
+            self._aim(worlds.nominal, worlds.rotation(), mask)
+        self.target_joints[mask] = qpos[mask, :JOINTS]
+        return self._anew(mask)
 
     def _draw_start(self, rng: np.random.Generator) -> Array:
         c, q = self.config, self._q_start
@@ -168,26 +154,31 @@ class PandaTask:
         """
         c, worlds = self.config, self.worlds
         action = checked(high_action, (self.num, c.high_size), "high-level action")
-        action = np.minimum(np.maximum(action, self._high_low), self._high_high)
-        mask = self._everyone if mask is None else self._checked_mask(mask)
+        action, mask = np.clip(action, *self._high), self._mask(mask)
         self._left[mask] = c.horizon * c.tick
         if c.command == "joint":
-            aimed = worlds.qpos[:, :JOINTS] + action
-            aimed = np.minimum(np.maximum(aimed, self._space_low), self._space_high)
+            aimed = np.clip(worlds.qpos[:, :JOINTS] + action, *self._space)
             self.target_joints[mask] = aimed[mask]
         elif c.increments:
             self._aim(worlds.nominal + action[:, :3], worlds.rotation() + action[:, 3:], mask)
         else:
             self._aim(action, np.zeros((self.num, 3)), mask)
-        return self._observe(mask)
+        return self._anew(mask)
 
     def _aim(self, position: Array, rotation: Array, mask: Mask) -> None:
-        position = np.minimum(np.maximum(position, self._space_low), self._space_high)
         length = np.sqrt((rotation**2).sum(-1, keepdims=True))
         limit = self.config.tilt_limit
         rotation = rotation * (limit / np.maximum(length, limit))
-        self.target[mask], self.target_rotation[mask] = position[mask], rotation[mask]
-        self._target_quat[mask] = pose_quat(rotation)[mask]
+        self.target[mask] = np.clip(position, *self._space)[mask]
+        self.target_rotation[mask] = rotation[mask]
+        self.worlds.quat[mask] = pose_quat(rotation)[mask]
+
+    def _anew(self, mask: Mask) -> Array:
+        """Observations; the integral of the masked worlds starts with the present y."""
+        worlds = self.worlds
+        worlds.refresh()
+        worlds.integral[mask, :3] = self.config.tick * worlds.latent[mask, :3]
+        return self._observe()[0]
 
     @property
     def due(self) -> Mask:
@@ -207,77 +198,32 @@ class PandaTask:
             `contact_force` at the end of the tick and `contact_force_max` over its physics steps
             (N), `penetration` (m, deepest of the tick), `success`.
         """
-        action = checked(u, (self.num, self.config.low_size), "low-level action")
-        action = np.clip(action, -1.0, 1.0, out=self._action)
-        action *= self._u_limit
-        worlds = self.worlds
-        if self.config.command == "pose":
-            worlds.tick_pose(self.target, self._target_quat, action)
-        else:
-            # The low-level action may only add to the pull towards the sub-goal (appendix G).
-            pull = np.sign(self.target_joints - worlds.qpos[:, :JOINTS])
-            worlds.tick_joint(self.target_joints, self.config.joint_stiffness, abs(action) * pull)
-        self._ticks += self._one
-        self._left -= self._tick
-        obs = self._observe(None)
-        lengths = self._lengths()
-        distance, peaks, tracking = lengths[0], worlds.peaks.copy(), -lengths[1::3]
-        terms = self._rewards(distance, lengths[2])
+        action = np.array(u, dtype=np.float64, order="C")
+        if action.shape != self._shape:
+            raise ValueError(f"low-level action: wanted {self._shape}, got {action.shape}")
+        self.worlds.tick(action)
+        obs, numbers, (ended, success) = self._observe(1)
+        distance, tilt, force, largest, deepest, missed, turned = numbers
+        reward, terms = self._reward(distance, tilt)
+        tracking = {"translation": missed, "rotation": turned}
         info = {
             "reward_terms": terms,
-            "tracking_terms": dict(zip(self._tracked, tracking, strict=False)),
-            "contact_force": lengths[3],
-            "contact_force_max": peaks[0],
-            "penetration": peaks[1],
-            "success": self._success(distance),
+            "tracking_terms": tracking if self._pose else {"joints": missed},
+            "contact_force": force,
+            "contact_force_max": largest,
+            "penetration": deepest,
+            "success": success,
         }
-        total: Array = functools.reduce(operator.add, terms.values())
-        return obs, total, self._nobody.copy(), self._ticks >= self.config.ticks, info
-
-    def _lengths(self) -> Array:
-        """Distances to goal and sub-goal, tilt, contact force, rotation error, (5, N)."""
-        vectors, views, worlds = self._vectors, self._views, self.worlds
-        np.subtract(self._aims, worlds.tip, out=vectors[:2])
-        vectors[2], vectors[3] = views["rotation"], worlds.force
-        if self.config.command == "pose":
-            vectors[4] = worlds.signals[:, 3:6]
-            return np.sqrt(np.vecdot(vectors, vectors))
-        vectors[4] = 0.0
-        joints = views["joint_error"]
-        lengths = np.sqrt(np.vecdot(vectors, vectors))
-        lengths[1] = np.sqrt(np.vecdot(joints, joints))
-        return lengths
+        return obs, reward, np.zeros(self.num, dtype=bool), ended, info
 
     # -- observations --------------------------------------------------------------------------
 
-    def _fields(self) -> dict[str, int]:
-        shared = {"position": 3, "rotation": 3, "velocity": 6, "goal": 3, **self._own_fields()}
-        if self.config.command == "joint":
-            return {**shared, "joints": JOINTS, "joint_velocity": JOINTS, "joint_error": JOINTS}
-        return {**shared, "error": 6, "latent": 6, "integral": 6}
-
-    def _observe(self, fresh: Mask | None) -> Array:
-        """Observations; `fresh` marks worlds whose integral starts anew, None means one tick on."""
-        views, worlds = self._views, self.worlds
-        views["position"][:] = worlds.tip
-        views["rotation"][:] = worlds.rotation()
-        views["velocity"][:] = worlds.tip_velocity
-        if self.config.command == "joint":
-            views["joints"][:] = worlds.qpos[:, :JOINTS]
-            views["joint_velocity"][:] = worlds.qvel[:, :JOINTS]
-            np.subtract(self.target_joints, views["joints"], out=views["joint_error"])
-        else:
-            worlds.aim(self.target, self._target_quat)
-            views["error"][:] = worlds.signals[:, :6]
-            latent = np.matmul(worlds.signals, self._to_latent, out=views["latent"])
-            if fresh is None:
-                self._integral += self._sum * latent  # I_k = I_{k-1} + h y_k
-            else:
-                self._integral[fresh] = self._sum * latent[fresh]
-        if fresh is not None:
-            views["goal"][:] = self._goal
-        self._observe_own(views)
-        return self._obs.copy()
+    def _observe(self, passed: int = 0) -> tuple[Array, Array, Mask]:
+        """Observations (N, size), numbers (7, N), time is up and success (2, N); see `measure`."""
+        obs, numbers = np.empty((self.num, self.observation_size)), np.empty((7, self.num))
+        flags = np.empty((2, self.num), dtype=bool)
+        measure(self.worlds.rows, self._state, self._fixed, passed, obs, numbers, flags)
+        return obs, numbers, flags
 
     def select(self, obs: Array, names: Sequence[str]) -> Array:
         """Concatenate the named fields of observations (..., size)."""
@@ -287,7 +233,7 @@ class PandaTask:
 
     def snapshot(self) -> dict[str, Any]:
         """Everything that decides what follows: physics, targets, counters, random streams."""
-        kept = {name: getattr(self, name).copy() for name in _KEPT}
+        kept = {name: array.copy() for name, array in self._kept().items()}
         streams = [stream.bit_generator.state for stream in self.streams]
         return {"physics": self.worlds.get_state(), "streams": streams, **kept}
 
@@ -302,27 +248,26 @@ class PandaTask:
         self.worlds.set_state(physics)
         for stream, state in zip(self.streams, snapshot["streams"], strict=True):
             stream.bit_generator.state = state
-        for name in _KEPT:
-            getattr(self, name)[:] = snapshot[name]
-        return self._observe(~self._everyone)
+        for name, array in self._kept().items():
+            array[:] = snapshot[name]
+        self.worlds.refresh()
+        return self._observe()[0]
 
-    def _checked_mask(self, mask: ArrayLike) -> Mask:
-        checked_mask = np.asarray(mask, dtype=bool)
-        if checked_mask.shape != (self.num,):
-            raise ValueError(f"wanted a mask of shape ({self.num},), got {checked_mask.shape}")
-        return checked_mask
+    def _kept(self) -> dict[str, Array]:
+        """What a snapshot holds apart from physics and random streams."""
+        own = {n: getattr(self, n) for n in ("target", "target_rotation", "target_joints")}
+        own |= {n: getattr(self, n) for n in ("_goal", "_ticks", "_left")}
+        return own | {"_target_quat": self.worlds.quat, "_integral": self.worlds.integral}
+
+    def _mask(self, mask: ArrayLike | None) -> Mask:
+        chosen = np.ones(self.num, bool) if mask is None else np.asarray(mask, dtype=bool)
+        if chosen.shape != (self.num,):
+            raise ValueError(f"wanted a mask of shape ({self.num},), got {chosen.shape}")
+        return chosen
 
 
-_KEPT = (
-    "target",
-    "_target_quat",
-    "target_rotation",
-    "target_joints",
-    "_integral",
-    "_goal",
-    "_ticks",
-    "_left",
-)
+def _rebuild(kind: type[PandaTask], config: PandaTaskConfig, num: int, threads: int) -> PandaTask:
+    return kind(config, num, threads=threads)
 
 
 def checked(value: ArrayLike, shape: tuple[int, ...], what: str) -> Array:
@@ -338,11 +283,3 @@ def checked(value: ArrayLike, shape: tuple[int, ...], what: str) -> Array:
     if not math.isfinite(flat.dot(flat)) and not np.isfinite(array).all():  # the first is faster
         raise ValueError(f"{what}: wanted finite numbers, got {array.tolist()}")
     return array
-
-
-def _slices(fields: Mapping[str, int]) -> tuple[dict[str, slice], int]:
-    layout, start = {}, 0
-    for name, size in fields.items():
-        layout[name] = slice(start, start + size)
-        start += size
-    return layout, start

@@ -9,9 +9,9 @@ import numpy as np
 
 from cmc.envs.panda_config import PandaTaskConfig
 from cmc.envs.panda_gym import PandaEnv, PandaVectorEnv
-from cmc.envs.panda_task import Array, Mask, PandaTask
+from cmc.envs.panda_task import Array, PandaTask
+from cmc.robot.osc import MAZE_GAINS, ControlLaw
 from cmc.robot.panda import Peg
-from cmc.robot.task_space import MAZE_GAINS, ControlLaw
 
 GOAL_LOW = np.array([0.410, -0.025, 0.005])
 GOAL_HIGH = np.array([0.415, -0.020, 0.015])
@@ -56,15 +56,13 @@ REGIMES = {"stiff": STIFF, "soft": SOFT, "joint": JOINT}
 class PegMaze(PandaTask):
     """N peg mazes; see `PegMazeEnv` for what they observe and are rewarded for."""
 
+    near = SUCCESS_DISTANCE
+
     def _draw_goal(self, rng: np.random.Generator) -> Array:
         return rng.uniform(GOAL_LOW, GOAL_HIGH)
 
-    def _rewards(self, distance: Array, tilt: Array) -> dict[str, Array]:
-        return {"distance": -distance}
-
-    def _success(self, distance: Array) -> Mask:
-        success: Mask = distance < SUCCESS_DISTANCE
-        return success
+    def _reward(self, distance: Array, tilt: Array) -> tuple[Array, dict[str, Array]]:
+        return -distance, {"distance": -distance}
 
 
 class PegMazeEnv(PandaEnv):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -10,9 +9,9 @@ import numpy as np
 
 from cmc.envs.panda_config import PandaTaskConfig
 from cmc.envs.panda_gym import PandaEnv, PandaVectorEnv
-from cmc.envs.panda_task import Array, Mask, PandaTask
+from cmc.envs.panda_task import Array, PandaTask
+from cmc.robot.osc import PUSH_GAINS, ControlLaw
 from cmc.robot.panda import Peg
-from cmc.robot.task_space import PUSH_GAINS, ControlLaw
 
 BOX_TOP = np.array([0.52, 0.0, 0.02])
 """Centre of the box's top, m; our choice: the arm can tilt by 0.5 rad all around it."""
@@ -40,25 +39,14 @@ PUSH = PandaTaskConfig(
 class PegPush(PandaTask):
     """N peg-push tasks; see `PegPushEnv` for what they observe and are rewarded for."""
 
-    def _own_fields(self) -> dict[str, int]:
-        return {"sliders": 3, "slider_velocity": 3}
-
-    def _observe_own(self, views: Mapping[str, Array]) -> None:
-        views["sliders"][:] = self.worlds.qpos[:, -3:]
-        views["slider_velocity"][:] = self.worlds.qvel[:, -3:]
+    sliders, box = 3, (TOUCH_SIDE, TOUCH_SIDE, TOUCH_DEPTH)
 
     def _draw_goal(self, rng: np.random.Generator) -> Array:
         return TARGET.copy()
 
-    def _rewards(self, distance: Array, tilt: Array) -> dict[str, Array]:
-        return {"translation": -np.tanh(50.0 * distance), "rotation": -0.1 * tilt}
-
-    def _success(self, distance: Array) -> Mask:
-        missing = np.abs(self._goal - self.worlds.tip)
-        return np.logical_and.reduce(missing < _TOUCH, axis=-1)
-
-
-_TOUCH = np.array([TOUCH_SIDE, TOUCH_SIDE, TOUCH_DEPTH])
+    def _reward(self, distance: Array, tilt: Array) -> tuple[Array, dict[str, Array]]:
+        near, upright = -np.tanh(50.0 * distance), -0.1 * tilt
+        return near + upright, {"translation": near, "rotation": upright}
 
 
 class PegPushEnv(PandaEnv):

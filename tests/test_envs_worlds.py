@@ -1,0 +1,240 @@
+"""Physics of the worlds: the compiled tick against numpy, pushes, threads, copies and pickles."""
+
+import copy
+from dataclasses import replace
+from pickle import dumps, loads
+
+import gymnasium as gym
+import joblib
+import mujoco
+import numpy as np
+import numpy_control
+import pytest
+
+import cmc.envs  # noqa: F401  (registers)
+from cmc.envs.peg_maze import JOINT, SOFT, STIFF, PegMaze
+from cmc.envs.peg_push import PUSH, PegPush
+
+FORCES = np.array([[2.0, 0, 0], [0, -1.0, 0.5], [0.3, 0.4, -1.2]])
+
+
+def _free(config, **changes):
+    return replace(config, scene="panda.xml", start_joints=0.0, start_box=(0.0,) * 3, **changes)
+
+
+JOINT_FIELDS = ("command", "subgoal_low", "subgoal_high", "u_limit")
+LIMP = {name: getattr(JOINT, name) for name in JOINT_FIELDS} | {"joint_stiffness": 0.0}
+"""Joint control with no stiffness: nothing but gravity is carried."""
+
+
+@pytest.mark.parametrize("peg", [STIFF, SOFT, PUSH], ids=["stiff", "soft", "push"])
+@pytest.mark.parametrize("num", [1, 3])
+def test_a_pushed_arm_moves_as_the_engine_says_for_a_generalized_force(num: int, peg) -> None:
+    wide = {"workspace_low": (-1.0,) * 7, "workspace_high": (1.0,) * 7}
+    config = _free(peg, hold=False, **LIMP, **wide)
+    task = PegMaze(config, num, seed=0)
+    model, data = task.worlds.model, mujoco.MjData(task.worlds.model)
+    hand, site = model.body("hand").id, model.site("tip_nominal").id
+    for _ in range(10):
+        task.worlds.push(FORCES[:num])
+        task.step(np.zeros((num, 7)))
+    for k in range(num):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:7] = task._q_start
+        for _ in range(100):
+            mujoco.mj_step1(model, data)
+            data.ctrl[:], data.qfrc_applied[:] = data.qfrc_bias[:7], 0.0
+            tip = data.site_xpos[site]
+            mujoco.mj_applyFT(model, data, FORCES[k], np.zeros(3), tip, hand, data.qfrc_applied)
+            mujoco.mj_step2(model, data)
+        mujoco.mj_step1(model, data)
+        moved = np.linalg.norm(data.site_xpos[site] - np.array(config.start))
+        assert moved > 1e-3
+        np.testing.assert_allclose(task.worlds.nominal[k], data.site_xpos[site], atol=1e-3 * moved)
+
+
+@pytest.mark.parametrize("num", [1, 3])
+def test_a_held_arm_gives_way_by_the_force_over_stiffness_and_effective_mass(num: int) -> None:
+    task = PegPush(_free(PUSH, workspace_low=(-1.0,) * 3, workspace_high=(1.0,) * 3), num, seed=0)
+    task.reset()
+    for _ in range(600):
+        task.worlds.push(0.1 * FORCES[:num])
+        task.step(np.zeros((num, 6)))
+    assert np.abs(task.worlds.signals[:, 6:]).max() < 1e-4
+    data = mujoco.MjData(task.worlds.model)
+    for k in range(num):
+        data.qpos[:] = task.worlds.qpos[k]
+        mujoco.mj_forward(task.worlds.model, data)
+        jac, solved = np.zeros((6, 7)), np.zeros((6, 7))
+        site = task.worlds.model.site("tip_nominal").id
+        mujoco.mj_jacSite(task.worlds.model, data, jac[:3], jac[3:], site)
+        mujoco.mj_solveM(task.worlds.model, data, solved, jac)
+        # At rest K_p e + J M^-1 J^T F = 0: the acceleration that the force alone would cause.
+        expected = -(solved @ jac.T)[:, :3] @ (0.1 * FORCES[k]) / PUSH.gains.kp
+        np.testing.assert_allclose(task.worlds.signals[k, :6], expected, rtol=0.01, atol=2e-5)
+
+
+@pytest.mark.parametrize("num", [1, 2])
+def test_a_push_ends_with_a_reset_and_travels_in_a_snapshot(num: int) -> None:
+    task, quiet = (PegPush(_free(PUSH), num, seed=0) for _ in range(2))
+    force, still = FORCES[:num], np.zeros((num, 6))
+    for t in (task, quiet):
+        t.reset()
+    task.worlds.push(force)
+    kept = task.snapshot()
+    task.step(still)
+    ends = [task.worlds.qpos.copy()]
+    task.worlds.push(np.zeros((num, 3)))
+    task.restore(kept)
+    task.step(still)
+    ends.append(task.worlds.qpos.copy())
+    quiet.step(still)
+    np.testing.assert_array_equal(*ends)
+    assert np.abs(ends[0] - quiet.worlds.qpos).max() > 1e-6
+    for t in (task, quiet):
+        t.seed(3)
+        t.reset()
+        t.step(still)
+    np.testing.assert_array_equal(task.worlds.qpos, quiet.worlds.qpos)
+
+
+@pytest.mark.parametrize("num", [1, 2])
+def test_a_push_of_wrong_shape_or_not_finite_is_refused(num: int) -> None:
+    worlds = PegPush(_free(PUSH), num, seed=0).worlds
+    with pytest.raises(ValueError, match=rf"push: wanted shape \({num}, 3\), got \(3,\)"):
+        worlds.push(np.zeros(3))
+    with pytest.raises(ValueError, match="push: wanted finite numbers"):
+        worlds.push(np.full((num, 3), np.nan))
+
+
+CASES = {
+    "stiff": (PegMaze, STIFF),
+    "soft": (PegMaze, SOFT),
+    "stiff, one block": (PegMaze, replace(STIFF, law=replace(STIFF.law, split=False, drift=True))),
+    "push": (PegPush, PUSH),
+    "stiff, every step": (PegMaze, replace(STIFF, hold=False)),
+    "push, every step": (PegPush, replace(PUSH, hold=False)),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_an_episode_in_contact_is_that_of_the_numpy_version(name):
+    """Two worlds, 30 ticks, random actions and sub-goals, against MuJoCo's own Python calls."""
+    kind, config = CASES[name]
+    task, rng = kind(config, 2, seed=0), np.random.default_rng(0)
+    model, law = task.worlds.model, replace(config.law, posture=tuple(task._q_start))
+    states, largest = task.worlds.get_state(), 0.0
+    worlds = [mujoco.MjData(model) for _ in range(2)]
+    for data, state in zip(worlds, states, strict=True):
+        mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_step1(model, data)
+    for k in range(30):
+        if k % 10 == 0:
+            high = rng.uniform(config.subgoal_low, config.subgoal_high, (2, config.high_size))
+            task.set_subgoal(high)
+        action = rng.uniform(-1.2, 1.2, (2, 6))
+        _, _, _, _, info = task.step(action)
+        for i, data in enumerate(worlds):
+            u = np.clip(action[i], -1, 1) * np.array(config.u_limit)
+            goal = (task.target[i], u, task.worlds.quat[i])
+            peak, depth = numpy_control.tick(model, data, config, law, *goal)
+            np.testing.assert_allclose(task.worlds.qpos[i], data.qpos, atol=1e-9)
+            np.testing.assert_allclose(task.worlds.qvel[i], data.qvel, atol=1e-8)
+            found = info["contact_force_max"][i], info["penetration"][i]
+            np.testing.assert_allclose(found, (peak, depth), rtol=1e-6, atol=1e-9)
+            push = -data.sensor("peg_force").data
+            np.testing.assert_allclose(task.worlds.force[i], push, rtol=1e-6, atol=1e-9)
+            largest = max(largest, peak)
+    assert largest > 0.1
+
+
+def test_joint_control_is_a_spring_an_action_towards_the_goal_and_gravity():
+    task, rng = PegMaze(replace(JOINT, hold=False), 1, seed=0), np.random.default_rng(0)
+    model, data = task.worlds.model, mujoco.MjData(task.worlds.model)
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    mujoco.mj_setState(model, data, task.worlds.get_state()[0], kind)
+    mujoco.mj_step1(model, data)
+    task.set_subgoal(rng.uniform(-0.1, 0.1, (1, 7)))
+    for _ in range(20):
+        action = rng.uniform(-1, 1, (1, 7))
+        pull = 0.3 * np.abs(action[0]) * np.sign(task.target_joints[0] - data.qpos)
+        task.step(action)
+        for _ in range(10):
+            data.ctrl[:] = 1.0 * (task.target_joints[0] - data.qpos) + pull + data.qfrc_bias
+            mujoco.mj_step2(model, data)
+            mujoco.mj_step1(model, data)
+        np.testing.assert_allclose(task.worlds.qpos[0], data.qpos, atol=1e-9)
+
+
+def test_threads_change_nothing():
+    alone, shared = PegPush(PUSH, 5, seed=0), PegPush(PUSH, 5, seed=0, threads=3)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        action = rng.uniform(-1, 1, (5, 6))
+        np.testing.assert_array_equal(alone.step(action)[0], shared.step(action)[0])
+    with pytest.raises(ValueError, match="finite"):
+        shared.step(np.full((5, 6), np.nan))
+
+
+# -- copies --------------------------------------------------------------------------------------
+
+NAMES = ["cmc/PegMaze-v0", "cmc/PegMazeJoint-v0", "cmc/PegPush-v0", "cmc/PegTouch-v0"]
+WAYS = {
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda env: loads(dumps(env)),
+}
+
+
+def _drive(env, seed, ticks=4):
+    env.action_space.seed(seed)
+    return [env.step(env.action_space.sample())[:2] for _ in range(ticks)]
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("started", [False, True])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_copy_goes_on_as_the_original_would(name, started, way):
+    env = gym.make(name)
+    if started:
+        env.reset(seed=3)
+        _drive(env, 0)
+    twin = WAYS[way](env)
+    if not started:
+        env.reset(seed=3)
+        twin.reset(seed=3)
+    here, there = _drive(env, 1), _drive(twin, 1)
+    for (one, reward), (other, same) in zip(here, there, strict=True):
+        np.testing.assert_array_equal(one, other)
+        assert reward == same
+    np.testing.assert_array_equal(env.reset()[0], twin.reset()[0])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_copied_vector_environment_goes_on_as_the_original_would(name):
+    envs = gym.make_vec(name, num_envs=2, vectorization_mode="vector_entry_point")
+    envs.reset(seed=0)
+    _drive(envs, 0)
+    twin = copy.deepcopy(envs)
+    for one, other in zip(_drive(envs, 1), _drive(twin, 1), strict=True):
+        np.testing.assert_array_equal(one[0], other[0])
+
+
+def _play(env):
+    env.reset(seed=3)
+    return [obs for obs, _ in _drive(env, 1)]
+
+
+def test_other_processes_play_the_same_episode():
+    """joblib's workers and Stable-Baselines3's SubprocVecEnv, over an environment made here."""
+    from stable_baselines3.common.vec_env import SubprocVecEnv
+
+    env = gym.make("cmc/PegMaze-v0")
+    found = joblib.Parallel(n_jobs=2)(joblib.delayed(_play)(env) for _ in range(2))
+    wanted = _play(env)
+    np.testing.assert_array_equal(found, [wanted, wanted])
+    venv = SubprocVecEnv([lambda: copy.deepcopy(env)] * 2)
+    venv.seed(3)
+    first = venv.reset()
+    env.reset(seed=3)
+    np.testing.assert_array_equal(first[0], env.reset(seed=3)[0])
+    venv.close()
