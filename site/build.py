@@ -1,0 +1,139 @@
+"""Build the static site: executed notebooks, live pages, results and the API, from disk and offline.
+
+    python site/build.py [--jobs 2] [--no-run] [--out build/site]
+
+Sources are laid out in build/site-source, notebooks are executed there, and Sphinx treats every
+warning as an error. Nothing is fetched, and the pages load nothing from elsewhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import pkgutil
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cmc
+
+ROOT = Path(__file__).resolve().parent.parent
+SITE = ROOT / "site"
+HIDDEN = {"exercises", "__main__"}
+"""Rooms that are not imported by readers."""
+
+
+def main() -> int:
+    """Lay out, execute, build; returns Sphinx's exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--jobs", type=int, default=2, help="notebooks side by side")
+    parser.add_argument("--no-run", action="store_true", help="keep notebooks executed before")
+    parser.add_argument("--out", type=Path, default=ROOT / "build" / "site")
+    chosen = parser.parse_args()
+    source, started = ROOT / "build" / "site-source", time.monotonic()
+    lay_out(source, keep=chosen.no_run)
+    if not chosen.no_run:
+        execute(source / "notebooks", chosen.jobs)
+    live_pages(source / "live")
+    status = sphinx(source, chosen.out)
+    if status == 0:
+        for folder in ("live", "notebooks/playback"):
+            if (source / folder).is_dir():
+                shutil.copytree(source / folder, chosen.out / folder, dirs_exist_ok=True)
+        prune(chosen.out)
+        size = sum(file.stat().st_size for file in chosen.out.rglob("*") if file.is_file())
+        seconds = time.monotonic() - started
+        print(f"{chosen.out / 'index.html'}: {size / 1e6:.0f} MB in {seconds:.0f} s")
+    return status
+
+
+def lay_out(source: Path, keep: bool) -> None:
+    """Pages of the site beside the notebooks; `keep` leaves executed notebooks where they are."""
+    kept = source / "notebooks"
+    if not (keep and kept.is_dir()):
+        shutil.rmtree(source, ignore_errors=True)
+        shutil.copytree(ROOT / "notebooks", kept, ignore=shutil.ignore_patterns("playback", ".*"))
+    for page in [*SITE.glob("*.md"), SITE / "conf.py"]:
+        shutil.copy(page, source / page.name)
+    shutil.copytree(SITE / "static", source / "static", dirs_exist_ok=True)
+    shutil.copy(ROOT / "CHANGELOG.md", source / "changelog.md")
+    lessons = "\n".join(f"notebooks/{p.stem}" for p in sorted(kept.glob("*.ipynb")))
+    index = (SITE / "index.md").read_text("utf-8").replace("@@LESSONS@@", lessons)
+    (source / "index.md").write_text(index, "utf-8")
+    (source / "notation.md").write_text(notation(), "utf-8")
+    (source / "results.md").write_text(results(), "utf-8")
+    (source / "api.md").write_text(api(source / "api"), "utf-8")
+
+
+def execute(folder: Path, jobs: int) -> None:
+    """Run all notebooks in place, in fast mode, with sliders that live without a kernel."""
+    settings = {"CMC_FAST": "1", "CMC_EXPORT": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--nbmake"]
+    command += ["--overwrite", "-n", str(jobs), str(folder)]
+    subprocess.run(command, check=True, cwd=ROOT, env={**os.environ, **settings})
+
+
+def live_pages(folder: Path) -> None:
+    """The pages in which MuJoCo runs."""
+    from cmc.studies import live
+
+    folder.mkdir(exist_ok=True)
+    for name in live.PAGES:
+        live.write(name, folder / f"{name}.html")
+
+
+def notation() -> str:
+    """The table of symbols as a page."""
+    from cmc import notation as table
+
+    return f"# Notation\n\n{table.markdown()}\n"
+
+
+def results() -> str:
+    """Every shipped table of results as a page."""
+    from cmc import results as shipped
+
+    return f"# All results\n\n{shipped.page()}\n"
+
+
+def api(folder: Path) -> str:
+    """One page a room, made from its docstrings; returns the page that lists them."""
+    folder.mkdir(exist_ok=True)
+    rooms: dict[str, list[str]] = {}
+    for module in pkgutil.walk_packages(cmc.__path__, "cmc."):
+        parts = module.name.split(".")
+        if parts[1] not in HIDDEN and not parts[-1].startswith("_"):
+            rooms.setdefault(parts[1], []).append(module.name)
+    for room, modules in rooms.items():
+        text = [f"# cmc.{room}\n"]
+        for name in modules:
+            text.append(f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n```\n")
+        (folder / f"{room}.md").write_text("\n".join(text), "utf-8")
+    listed = "\n".join(f"api/{room}" for room in rooms)
+    return f"# Library\n\n```{{toctree}}\n:maxdepth: 2\n\n{listed}\n```\n"
+
+
+def sphinx(source: Path, out: Path) -> int:
+    """Build with warnings as errors."""
+    from sphinx.cmd.build import build_main
+
+    return build_main(["-q", "-W", "--keep-going", "-b", "html", str(source), str(out)])
+
+
+def prune(out: Path) -> None:
+    """Drop what no page uses: MathJax's other input and output formats, Sphinx's own leavings."""
+    for leaving in (".buildinfo", ".doctrees", "objects.inv"):
+        target = out / leaving
+        shutil.rmtree(target, ignore_errors=True) if target.is_dir() else target.unlink(True)
+    used = re.compile(r"(tex-mml-chtml|tex-chtml|/output/chtml/fonts/|/input/tex/)")
+    for file in out.rglob("*"):
+        if "mathjax" in str(file).lower() and file.suffix in (".js", ".woff") and file.is_file():
+            if not used.search(file.as_posix()) and file.name != "mathjax.js":
+                file.unlink()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
