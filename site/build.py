@@ -9,6 +9,8 @@ warning as an error. Nothing is fetched, and the pages load nothing from elsewhe
 from __future__ import annotations
 
 import argparse
+import importlib
+import inspect
 import os
 import pkgutil
 import re
@@ -110,10 +112,28 @@ def api(folder: Path) -> str:
     for room, modules in rooms.items():
         text = [f"# cmc.{room}\n"]
         for name in modules:
-            text.append(f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n```\n")
+            pages = markdown_pages(name)
+            left_out = f"   :exclude-members: {', '.join(pages)}\n" if pages else ""
+            text.append(f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n{left_out}```\n")
+            text += [f"### {title}\n\n{page}\n" for title, page in pages.items()]
         (folder / f"{room}.md").write_text("\n".join(text), "utf-8")
     listed = "\n".join(f"api/{room}" for room in rooms)
     return f"# Library\n\n```{{toctree}}\n:maxdepth: 2\n\n{listed}\n```\n"
+
+
+def markdown_pages(module: str) -> dict[str, str]:
+    """Classes of a module that document themselves in Markdown, as environments do."""
+    space = vars(importlib.import_module(module))
+    found = {
+        name: inspect.getdoc(value) or ""
+        for name, value in space.items()
+        if inspect.isclass(value) and value.__module__ == module
+    }
+    return {
+        name: re.sub(r"^##", "####", text, flags=re.MULTILINE)
+        for name, text in found.items()
+        if "\n## " in text
+    }
 
 
 def sphinx(source: Path, out: Path) -> int:

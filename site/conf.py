@@ -1,11 +1,12 @@
 """Sphinx configuration of the static site; `site/build.py` lays out the sources and calls Sphinx."""
 
-from importlib.metadata import version
+import importlib.metadata
+import re
 
 project = "cmc"
 author = "The authors of cmc"
 copyright = author
-release = version("cmc")
+release = importlib.metadata.version("cmc")
 
 extensions = [
     "myst_nb",
@@ -16,7 +17,7 @@ extensions = [
 exclude_patterns = ["playback/*", "live/*"]
 myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
-suppress_warnings = ["mystnb.unknown_mime_type", "myst.header"]
+suppress_warnings = ["mystnb.unknown_mime_type", "myst.header", "ref.python"]
 
 # The notebooks come executed; sliders are self-contained HTML, so no widget manager is loaded.
 nb_execution_mode = "off"
@@ -27,6 +28,7 @@ nb_mime_priority_overrides = [
 ]
 nb_ipywidgets_js = {}
 
+default_role = "literal"
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_default_options = {"members": True, "show-inheritance": True}
@@ -51,3 +53,16 @@ html_theme_options = {
     "navigation_with_keys": False,
     "use_edit_page_button": False,
 }
+
+
+def plain_text(app, what, name, obj, options, lines):
+    """Docstrings are plain text: |x| is a size and a * b a product, not markup."""
+    for k, line in enumerate(lines):
+        parts = re.split(r"(`[^`]*`)", line)
+        parts[::2] = [re.sub(r"([|*])", r"\\\1", part) for part in parts[::2]]
+        lines[k] = "".join(parts)
+
+
+def setup(app):
+    """Run before napoleon reads the sections."""
+    app.connect("autodoc-process-docstring", plain_text, priority=100)
