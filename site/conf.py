@@ -60,7 +60,9 @@ def plain_text(app, what, name, obj, options, lines):
     for k, line in enumerate(lines):
         parts = re.split(r"(`[^`]*`)", line)
         parts[::2] = [re.sub(r"([|*])", r"\\\1", part) for part in parts[::2]]
-        lines[k] = "".join(parts)
+        line = "".join(parts)
+        # napoleon takes what stands before a colon in an attribute's text for its type
+        lines[k] = line.replace(":", "\N{RATIO}") if what in ("data", "attribute") else line
 
 
 def setup(app):
