@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import subprocess
 import sys
 import zipfile
@@ -78,6 +79,36 @@ def test_the_import_check_sees_every_form_of_import(tmp_path: Path) -> None:
     text = "import cmc.envs\nfrom cmc import plants\nfrom ..view import figures\nfrom . import x\n"
     node_rooms = imported_rooms_of(text, source)
     assert {"envs", "plants", "view", "theory"} <= node_rooms
+
+
+def imported_modules(path: Path, modules: set[str]) -> set[str]:
+    """Modules of cmc that a file imports, at its top or inside its functions."""
+    here = ["cmc", *path.relative_to(PACKAGE).with_suffix("").parts]
+    package = here[:-1]
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            stem = ".".join([*base, *([node.module] if node.module else [])])
+            names = {f"{stem}.{alias.name}" for alias in node.names}
+            found |= names & modules or {stem}
+            found |= {stem} if names - modules else set()
+    return (found & modules) - {".".join(here)}
+
+
+def test_no_import_goes_round_in_a_circle() -> None:
+    """Inside of packages too, and imports inside of functions count."""
+    names = {p: ".".join(["cmc", *p.relative_to(PACKAGE).with_suffix("").parts]) for p in SOURCES}
+    names = {p: name.removesuffix(".__init__") for p, name in names.items()}
+    modules = set(names.values())
+    graph = {name: imported_modules(path, modules) for path, name in names.items()}
+    assert sum(map(len, graph.values())) > len(graph)  # arrows were found
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        pytest.fail("imports go round: " + " -> ".join(error.args[1]))
 
 
 def imported_rooms_of(text: str, pretended: Path) -> set[str]:
