@@ -1,4 +1,4 @@
-"""Build the static site: executed notebooks, live pages, results and the API, from disk and offline.
+"""Build the static site: executed notebooks, live pages, results and the API, all offline.
 
     python site/build.py [--jobs 2] [--no-run] [--out build/site]
 
@@ -148,11 +148,10 @@ def prune(out: Path) -> None:
     for leaving in (".buildinfo", ".doctrees", "objects.inv"):
         target = out / leaving
         shutil.rmtree(target, ignore_errors=True) if target.is_dir() else target.unlink(True)
-    used = re.compile(r"(tex-mml-chtml|tex-chtml|/output/chtml/fonts/|/input/tex/)")
-    for file in out.rglob("*"):
-        if "mathjax" in str(file).lower() and file.suffix in (".js", ".woff") and file.is_file():
-            if not used.search(file.as_posix()) and file.name != "mathjax.js":
-                file.unlink()
+    used = re.compile(r"tex-(mml-)?chtml\.js|/output/chtml/fonts/|/input/tex/extensions/")
+    for file in out.rglob("*mathjax*/**/*"):
+        if file.is_file() and not used.search(file.as_posix()):
+            file.unlink()
 
 
 if __name__ == "__main__":

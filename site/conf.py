@@ -1,4 +1,4 @@
-"""Sphinx configuration of the static site; `site/build.py` lays out the sources and calls Sphinx."""
+"""Sphinx configuration of the static site; `build.py` lays out the sources and calls Sphinx."""
 
 import importlib.metadata
 import re
