@@ -21,8 +21,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from cmc.learning.replay import Replay
-from cmc.learning.td3 import TD3, TD3Config
+from cmc.learning.td3 import TD3, Replay, TD3Config
 from cmc.studies import peg_maze, peg_push
 from cmc.studies.two_level import TwoLevelStudy
 from cmc.studies.two_level_parts import Planner, build

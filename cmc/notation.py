@@ -48,7 +48,7 @@ SIGNALS = (
     Symbol(
         r"s_i = (z_i, \int z_i)",
         "s",
-        "cmc.policies.positive.PositiveNetwork.forward(s)",
+        "cmc.policies.networks.PositiveNetwork.forward(s)",
         "n, 2",
         "plant, plant s",
         "v",

@@ -23,8 +23,7 @@ from cmc.learning.hiro import (
     subgoal_transition,
 )
 from cmc.learning.low_level import Segment, evaluate
-from cmc.learning.replay import Batch
-from cmc.learning.td3 import TD3, TD3Config
+from cmc.learning.td3 import TD3, Batch, TD3Config
 from cmc.robot.panda import FINGERTIP, forward_kinematics
 from cmc.studies import peg_maze
 

@@ -10,7 +10,7 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import nn
 
-from cmc.learning.latent_rollout import LatentConfig, LatentLow, LatentModel
+from cmc.learning.latent import LatentConfig, LatentLow, LatentModel
 from cmc.learning.low_level import Segment
 from cmc.studies import peg_push
 from cmc.studies.two_level_parts import build_low

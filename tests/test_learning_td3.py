@@ -7,8 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from cmc.learning.replay import Replay
-from cmc.learning.td3 import TD3, TD3Config
+from cmc.learning.td3 import TD3, Replay, TD3Config
 from cmc.policies import StackedMLP
 
 SIZE, ACTION = 3, 2

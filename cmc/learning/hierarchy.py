@@ -7,20 +7,19 @@ anew with every sub-goal. All worlds of all seeds move in step.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import nn
 
 from cmc.envs.panda_task import CRITIC, PandaTask
-from cmc.learning.low_level import LowLevel, Segment, evaluate, under
+from cmc.learning.low_level import CriticLow, LowLevel, Segment, evaluate
 from cmc.learning.planning import Planning
-from cmc.learning.replay import Batch, Replay
-from cmc.learning.saved import save_training, saved_training
-from cmc.learning.td3 import TD3
+from cmc.learning.state import Arrays, Resumable, State, set_streams, streams, under, within
+from cmc.learning.td3 import TD3, Batch, Replay
 
 Array = NDArray[np.float64]
 JOINT_STATE = ("joints", "joint_velocity", "joint_error")
@@ -129,7 +128,7 @@ class Relabeller(Protocol):
         """Continue from `state`."""
 
 
-class TwoLevel:
+class TwoLevel(Resumable):
     """Trains a planner and a low level on one task, several seeds side by side.
 
     Args:
@@ -161,6 +160,7 @@ class TwoLevel:
         self.relabeller = relabeller
         self.shape = (len(seeds), config.worlds)
         self.steps = 0  # environment steps of each seed
+        self.success = np.full(len(seeds), np.nan)  # share of the last episodes that succeeded
         self._generators = [np.random.default_rng([seed, 1, 17]) for seed in seeds]
         task.seed([1_000_003 * seed + k for seed in seeds for k in range(config.worlds)])
         self._obs = task.reset()
@@ -181,7 +181,10 @@ class TwoLevel:
         middle = planning.direction(task, self._obs)
         action = self._choose(self._split(seen), self._split(middle) if middle.ndim else middle)
         obs = task.set_subgoal(planning.subgoal(self._join(action)))
-        segment, reward, self._obs, over = rollout(task, self.low, obs, self.shape, explore=True)
+        last: dict[str, Any] = {}
+        segment, reward, self._obs, over = rollout(
+            task, self.low, obs, self.shape, explore=True, watch=last.update
+        )
         following = planning.observe(task, self._obs)
         gain = self.config.reward_scale * reward
         # An episode ends by its time limit only: the next value always counts.
@@ -192,6 +195,7 @@ class TwoLevel:
         self.steps += self.stride
         self._learn(before)
         if over:
+            self.success[:] = self._split(last["success"]).mean(1)
             self._obs = task.reset()
         return reward.mean(1)
 
@@ -228,41 +232,39 @@ class TwoLevel:
     def _join(self, array: Array) -> Array:
         return array.reshape(-1, *array.shape[2:])
 
-    def save(self, path: str | Path, record: Mapping[str, Any]) -> None:
-        """Write everything that decides what follows, atomically."""
-        arrays: dict[str, np.ndarray] = {}
-        state: dict[str, Any] = {"steps": self.steps, "settings": asdict(self.config)}
-        planner, replay, low = self.planner.state(), self.replay.state(), self.low.state()
-        for name, part in (("planner", planner), ("replay", replay), ("low", low)):
-            tensors, state[name] = part
-            arrays |= {f"{name}/{key}": value for key, value in tensors.items()}
-        arrays["burst"] = self._burst
+    def actors(self) -> dict[str, nn.Module]:
+        """The networks that act: "planner" and, where it has one, "low"."""
+        low = self.low
+        actor = low.agent.actor if isinstance(low, CriticLow) else getattr(low, "actor", None)
+        return {"planner": self.planner.actor} | ({} if actor is None else {"low": actor})
+
+    def state(self) -> State:
+        """Both levels, memory, physics, random streams."""
         world = self.task.snapshot()
-        state["streams"] = world.pop("streams")
-        state["noise"] = [g.bit_generator.state for g in self._generators]
-        if self.relabeller:
-            state["relabeller"] = self.relabeller.state()
-        arrays |= {f"task/{key}": value for key, value in world.items()}
-        save_training(path, arrays, record, self.seeds, state)
+        record: dict[str, Any] = {
+            "steps": self.steps,
+            "streams": world.pop("streams"),
+            "noise": streams(self._generators),
+            "relabeller": self.relabeller.state() if self.relabeller else None,
+        }
+        arrays = {**within("task/", world), "burst": self._burst}
+        levels = (self.planner.state(), self.replay.state(), self.low.state())
+        for name, (found, kept) in zip(("planner", "replay", "low"), levels, strict=True):
+            arrays |= within(f"{name}/", found)
+            record[name] = kept
+        return arrays, record
 
-    def load(self, path: str | Path, record: Mapping[str, Any]) -> None:
-        """Continue from `save`.
-
-        Raises:
-            CheckpointError: if the file is damaged or of another training.
-        """
-        arrays, state = saved_training(path, record, self.seeds, asdict(self.config))
-        self.planner.restore(under(arrays, "planner/"), state["planner"])
-        self.replay.restore(under(arrays, "replay/"), state["replay"])
-        self.low.restore(under(arrays, "low/"), state["low"])
-        world = {**under(arrays, "task/"), "streams": state["streams"]}
-        self._obs = self.task.restore(world)
-        for generator, kept in zip(self._generators, state["noise"], strict=True):
-            generator.bit_generator.state = kept
+    def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
+        """Continue from `state`."""
+        self.planner.restore(under(arrays, "planner/"), record["planner"])
+        self.replay.restore(under(arrays, "replay/"), record["replay"])
+        self.low.restore(under(arrays, "low/"), record["low"])
+        self._obs = self.task.restore({**under(arrays, "task/"), "streams": record["streams"]})
+        set_streams(self._generators, record["noise"])
         if self.relabeller:
-            self.relabeller.restore(state["relabeller"])
+            self.relabeller.restore(record["relabeller"])
         self._burst[:] = arrays["burst"]
-        self.steps = int(state["steps"])
+        self.steps = int(record["steps"])
 
 
 def low_fields(task: PandaTask) -> tuple[str, ...]:
@@ -271,7 +273,12 @@ def low_fields(task: PandaTask) -> tuple[str, ...]:
 
 
 def rollout(
-    task: PandaTask, low: LowLevel, obs: Array, shape: tuple[int, int], explore: bool
+    task: PandaTask,
+    low: LowLevel,
+    obs: Array,
+    shape: tuple[int, int],
+    explore: bool,
+    watch: Callable[[dict[str, Any]], object] | None = None,
 ) -> tuple[Segment, Array, Array, bool]:
     """Run the low level until the next sub-goal is due.
 
@@ -281,6 +288,7 @@ def rollout(
         obs: (worlds, size).
         shape: (seeds, worlds of each).
         explore: whether the low level explores.
+        watch: called after each tick with `info`, the observation and the reward.
 
     Returns:
         The segment, mean rewards (seeds, worlds), the last observations, whether time is up.
@@ -303,6 +311,52 @@ def rollout(
         for name, value in info["tracking_terms"].items():
             terms.setdefault(name, []).append(value.reshape(shape))
         over = bool(truncated[0])
+        if watch is not None:
+            watch({**info, "observation": obs, "reward": reward})
     tracking = {name: np.stack(values) for name, values in terms.items()}
     segment = Segment(np.stack(views), np.stack(actions), tracking, np.stack(forces))
     return segment, (total / task.config.horizon).reshape(shape), obs, over
+
+
+def play(
+    task: PandaTask,
+    planning: Planning,
+    planner: nn.Module,
+    low: LowLevel,
+    seeds: int,
+    keep: Sequence[str],
+    ticks: int | None = None,
+) -> dict[str, Array]:
+    """One episode of every world without exploration, and what is kept of every tick.
+
+    Args:
+        task: S * M worlds, those of a seed side by side; its random streams decide the starts.
+        planning: normalization.
+        planner: sub-goals in [-1, 1] from (S, M, size).
+        low: the low level.
+        seeds: how many trained seeds S the networks hold.
+        keep: names out of what `task.step` tells (`reward`, `observation`, `success`,
+            `contact_force`, ...), `distance` to the goal (m), and the worlds' `tip`, `target` (the
+            sub-goal), `qpos` and `force` (3,).
+        ticks: in place of the whole episode, in whole segments.
+
+    Returns:
+        Arrays (T, S, M, ...) by name, taken after each tick.
+    """
+    kept: dict[str, list[Array]] = {name: [] for name in keep}
+    shape = (seeds, task.num // seeds)
+
+    def watch(found: dict[str, Any]) -> None:
+        worlds, obs = task.worlds, found["observation"]
+        missing = obs[:, task.layout["goal"]] - obs[:, task.layout["position"]]
+        found |= {"distance": np.sqrt((missing**2).sum(-1)), "target": task.target}
+        found |= {"tip": worlds.tip, "qpos": worlds.qpos, "force": worlds.force}
+        for name, rows in kept.items():
+            rows.append(np.array(found[name]).reshape(*shape, *np.shape(found[name])[1:]))
+
+    obs = task.reset()
+    for _ in range((ticks or task.config.ticks) // task.config.horizon):
+        aim = planning.subgoal(evaluate(planner, planning.observe(task, obs).reshape(*shape, -1)))
+        obs = task.set_subgoal(aim.reshape(task.num, -1))
+        *_, obs, _ = rollout(task, low, obs, shape, explore=False, watch=watch)
+    return {name: np.stack(rows) for name, rows in kept.items()}

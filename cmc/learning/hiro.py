@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from cmc.learning.low_level import CriticLow, Segment
-from cmc.learning.replay import Batch
-from cmc.learning.td3 import TD3
+from cmc.learning.state import set_streams, streams
+from cmc.learning.td3 import TD3, Batch
 from cmc.policies import StackedMLP, tanh
 
 Array = NDArray[np.float64]
@@ -216,13 +216,12 @@ class OffPolicyCorrection:
         return goals, log_likelihood(actor, states, speeds, actions, goals, self._reach)
 
     def state(self) -> list[Any]:
-        """The generators' states."""
-        return [generator.bit_generator.state for generator in self._generators]
+        """The random streams."""
+        return streams(self._generators)
 
     def restore(self, state: list[Any]) -> None:
         """Continue from `state`."""
-        for generator, kept in zip(self._generators, state, strict=True):
-            generator.bit_generator.state = kept
+        set_streams(self._generators, state)
 
 
 def _tensor(value: Array) -> Tensor:

@@ -14,14 +14,13 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor, nn
+from torch import nn
 
-from cmc.learning.replay import Replay
-from cmc.learning.td3 import TD3
-from cmc.policies import IndependentNetwork, PositiveNetwork, tanh
+from cmc.learning.state import Arrays, State, learned, relearn, set_streams, streams, under, within
+from cmc.learning.td3 import TD3, Replay
+from cmc.policies import IndependentNetwork, ModularPolicy, PositiveNetwork, as_numpy
 
 Array = NDArray[np.float64]
-State = tuple[dict[str, np.ndarray], dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -56,28 +55,18 @@ class LowLevel(Protocol):
     def state(self) -> State:
         """All that is needed to continue."""
 
-    def restore(self, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:
+    def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
         """Continue from `state`."""
 
 
-class ModularActor(nn.Module):
-    """u_i = tanh(pi_i(y_i, integral of y_i)): one network per dimension, bounded by 1.
+def latent_policy(network: nn.Module) -> ModularPolicy:
+    """u_i = tanh(pi_i(y_i, integral of y_i)) on (y, integral of y, ...), whose slope is positive.
 
-    The last tanh has a slope of at most 1, so bounds on the slopes of pi hold for u too.
-
-    Args:
-        net: maps s (seeds, batch, n, 2) to (seeds, batch, n).
-        n: number of dimensions.
+    An action pulls towards the sub-goal, e'' + ... + u = 0 (`2nd_sys`): R is negative.
     """
-
-    def __init__(self, net: nn.Module, n: int) -> None:
-        super().__init__()
-        self.net, self.n = net, n
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """Actions (seeds, batch, n) from observations (seeds, batch, at least 2n)."""
-        s = observation[..., : 2 * self.n].unflatten(-1, (2, self.n)).transpose(-1, -2)
-        return tanh(self.net(s))
+    n = int(network.n)  # type: ignore[arg-type]
+    layout = {"z": slice(0, n), "integral": slice(n, 2 * n)}
+    return ModularPolicy(network, layout=layout, R=-1.0, squash=True)
 
 
 @torch.no_grad()
@@ -123,15 +112,11 @@ class Fixed:
 
     def state(self) -> State:
         """The actor's weights."""
-        if self.actor is None:
-            return {}, {}
-        return {k: v.detach().numpy().copy() for k, v in self.actor.named_parameters()}, {}
+        return learned(dict(self.actor.named_parameters()) if self.actor else {}, None), {}
 
-    def restore(self, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:
+    def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
         """Put the actor's weights back."""
-        with torch.no_grad():
-            for name, parameter in self.actor.named_parameters() if self.actor else ():
-                parameter.copy_(torch.from_numpy(arrays[name]))
+        relearn(arrays, dict(self.actor.named_parameters()) if self.actor else {}, None)
 
 
 class CriticLow:
@@ -194,30 +179,20 @@ class CriticLow:
 
     def state(self) -> State:
         """Agent, memory and noise."""
-        agent, agent_record = self.agent.state()
-        replay, replay_record = self.replay.state()
-        arrays = {f"agent/{k}": v for k, v in agent.items()}
-        arrays |= {f"replay/{k}": v for k, v in replay.items()}
-        noise = [g.bit_generator.state for g in self._generators]
-        return arrays, {"agent": agent_record, "replay": replay_record, "noise": noise}
+        (agent, first), (replay, second) = self.agent.state(), self.replay.state()
+        record = {"agent": first, "replay": second, "noise": streams(self._generators)}
+        return within("agent/", agent) | within("replay/", replay), record
 
-    def restore(self, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:
+    def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
         """Continue from `state`."""
         self.agent.restore(under(arrays, "agent/"), record["agent"])
         self.replay.restore(under(arrays, "replay/"), record["replay"])
-        for generator, state in zip(self._generators, record["noise"], strict=True):
-            generator.bit_generator.state = state
+        set_streams(self._generators, record["noise"])
 
 
-@torch.no_grad()
 def evaluate(actor: nn.Module, observation: Array) -> Array:
     """The actor's output as an array of floats."""
-    return actor(torch.from_numpy(observation.astype(np.float32))).numpy().astype(np.float64)
-
-
-def under(arrays: dict[str, np.ndarray], start: str) -> dict[str, np.ndarray]:
-    """Entries whose name has the given start, without it."""
-    return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}
+    return as_numpy(actor)(observation).astype(np.float64)
 
 
 def _flat(part: Array) -> Array:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -14,12 +12,10 @@ from numpy.typing import NDArray
 from torch import nn
 
 from cmc.envs.panda_task import PandaTask
-from cmc.learning import training_state
 from cmc.learning.hierarchy import rollout
 from cmc.learning.low_level import Fixed
 from cmc.learning.planning import Planning
 from cmc.learning.ppo import PPO, PPOConfig
-from cmc.learning.saved import save_training, saved_training
 
 Array32 = NDArray[np.float32]
 
@@ -43,7 +39,8 @@ class SegmentEnv(VectorEnv[Array32, Array32, NDArray[Any]]):
         size, ends = planning.observe(task, task.reset()).shape[-1], len(planning.low)
         self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
         self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (ends,), np.float32)
-        self._idle = Fixed(None, task.config.low_size)
+        self.idle = Fixed(None, task.config.low_size)
+        self.success = np.zeros(task.num)  # at the last tick of the latest segment
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -65,7 +62,10 @@ class SegmentEnv(VectorEnv[Array32, Array32, NDArray[Any]]):
         """One segment of every world."""
         aim = self.planning.subgoal(np.clip(actions.astype(np.float64), -1.0, 1.0))
         obs = self.task.set_subgoal(aim)
-        _, reward, obs, over = rollout(self.task, self._idle, obs, (1, self.num_envs), False)
+        last: dict[str, Any] = {}
+        shape = (1, self.num_envs)
+        _, reward, obs, over = rollout(self.task, self.idle, obs, shape, False, last.update)
+        self.success[:] = last["success"]
         gain = self.reward_scale * reward[0]
         ended, limit = np.zeros(self.num_envs, bool), np.full(self.num_envs, over)
         return self._seen(obs), gain, ended, limit, {}
@@ -74,33 +74,23 @@ class SegmentEnv(VectorEnv[Array32, Array32, NDArray[Any]]):
         return self.planning.observe(self.task, obs).astype(np.float32)
 
 
-@dataclass
-class _Planner:
-    """The actor under the name by which trainings of two levels hold theirs."""
+class OneLevelPPO(PPO):
+    """PPO on `SegmentEnv`, with the face of a two-level training; an update is whole episodes.
 
-    actor: nn.Module
-
-
-@dataclass
-class OneLevelPPO:
-    """PPO on `SegmentEnv`, with the face of a two-level training.
-
-    Attributes:
+    Args:
         env: several worlds of each seed.
         actor: the policy.
         seeds: one integer for each seed.
-        config: hyperparameters; an update is whole episodes.
+        config: hyperparameters.
     """
 
     env: SegmentEnv
-    actor: nn.Module
-    seeds: Sequence[int]
-    config: PPOConfig
-    low: Fixed = field(init=False)
 
-    def __post_init__(self) -> None:
-        self.planner, self.low = _Planner(self.actor), Fixed(None, self.env.task.config.low_size)
-        self.ppo = PPO(self.env, self.actor, self.seeds, self.config)
+    def __init__(
+        self, env: SegmentEnv, actor: nn.Module, seeds: Sequence[int], config: PPOConfig
+    ) -> None:
+        super().__init__(env, actor, seeds, config)
+        self.low = env.idle
 
     @property
     def stride(self) -> int:
@@ -111,7 +101,12 @@ class OneLevelPPO:
     @property
     def steps(self) -> int:
         """Environment steps of each seed so far."""
-        return self.ppo.updates * self.stride
+        return self.updates * self.stride
+
+    @property
+    def success(self) -> NDArray[np.float64]:
+        """Share of each seed's last episodes that were solved at their end, (seeds,)."""
+        return self.env.success.reshape(len(self.seeds), -1).mean(1)
 
     def segment(self) -> NDArray[np.float64]:
         """One update; mean rewards (seeds,).
@@ -124,19 +119,9 @@ class OneLevelPPO:
             raise ValueError(
                 f"wanted two segments for each of {self.config.minibatches} minibatches, got {size}"
             )
-        total = self.ppo.update()["episode_return"]
+        total = self.update()["episode_return"]
         return np.asarray(total / (self.config.steps * self.env.reward_scale), dtype=np.float64)
 
-    def save(self, path: str | Path, record: Mapping[str, Any]) -> None:
-        """Write everything that decides what follows, atomically."""
-        state = {"settings": asdict(self.config)}
-        save_training(path, training_state.take(self.ppo), record, self.seeds, state)
-
-    def load(self, path: str | Path, record: Mapping[str, Any]) -> None:
-        """Continue from `save`.
-
-        Raises:
-            CheckpointError: if the file is damaged or of another training.
-        """
-        arrays, _ = saved_training(path, record, self.seeds, asdict(self.config))
-        training_state.put(self.ppo, arrays)
+    def actors(self) -> dict[str, nn.Module]:
+        """The network that acts, as "planner"."""
+        return {"planner": self.policy}

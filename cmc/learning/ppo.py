@@ -15,7 +15,7 @@ training that is killed and resumed ends with the weights of one that was not.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,8 @@ import torch
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
 
-from cmc.learning import training_state
 from cmc.learning.rollout import Rollout, collect
-from cmc.learning.seed_axis import clip_gradients, shuffle, single_thread
-from cmc.learning.surrogate import generalised_advantage, normalised, surrogate_gradient
+from cmc.learning.state import Arrays, Resumable, State, learned, relearn, single_thread
 from cmc.policies import StackedMLP
 
 Callback = Callable[[dict[str, Any]], object]
@@ -35,32 +33,34 @@ Callback = Callable[[dict[str, Any]], object]
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """Hyperparameters. The paper gives none: all are our choice."""
+    """Hyperparameters. The paper gives none: all are our choice.
+
+    Attributes:
+        steps: environment steps of each trajectory in an update; a multiple of the episode length.
+        epochs: passes over the data of an update.
+        minibatches: minibatches a pass.
+        learning_rate: Adam's step size.
+        gamma: discount factor.
+        gae_lambda: lambda of the generalised advantage estimate.
+        clip: half-width of the interval to which the probability ratio is clipped.
+        value_weight: weight of the critic's squared error in the loss.
+        max_norm: largest norm of a seed's gradient.
+        log_std_start, log_std_floor: first and smallest logarithm of the noise's deviation.
+        critic_hidden: hidden layers of the critic.
+    """
 
     steps: int = 50
-    """Environment steps of each trajectory in an update; a multiple of the episode length."""
     epochs: int = 4
-    """Passes over the data of an update."""
     minibatches: int = 4
-    """Minibatches a pass."""
     learning_rate: float = 2e-3
-    """Adam's step size."""
     gamma: float = 0.99
-    """Discount factor."""
     gae_lambda: float = 0.95
-    """Lambda of the generalised advantage estimate."""
     clip: float = 0.2
-    """Half-width of the interval to which the probability ratio is clipped."""
     value_weight: float = 0.5
-    """Weight of the critic's squared error in the loss."""
     max_norm: float = 0.5
-    """Largest norm of a seed's gradient."""
     log_std_start: float = -1.0
-    """First logarithm of the exploration noise's standard deviation."""
     log_std_floor: float = -4.0
-    """Smallest logarithm of the standard deviation."""
     critic_hidden: tuple[int, ...] = (64, 64)
-    """Hidden layers of the critic."""
 
     def __post_init__(self) -> None:
         for name in ("steps", "epochs", "minibatches"):
@@ -74,7 +74,7 @@ class PPOConfig:
                 raise ValueError(f"{name}: wanted a number in [0, 1], got {getattr(self, name)}")
 
 
-class PPO:
+class PPO(Resumable):
     """Train `policy` on `env` with several seeds at once.
 
     Args:
@@ -128,6 +128,7 @@ class PPO:
         """Trajectories of `config.steps` steps that each seed has seen."""
         return self.updates * (self.env.num_envs // len(self.seeds))
 
+    @single_thread()
     def update(self) -> dict[str, Any]:
         """Collect one batch of trajectories, learn from it, and report.
 
@@ -136,10 +137,6 @@ class PPO:
             `episode_return` (sum of rewards over `config.steps` steps, mean over trajectories),
             `value_loss`, `clip_fraction`, `std` (S, n).
         """
-        with single_thread():
-            return self._update()
-
-    def _update(self) -> dict[str, Any]:
         c = self.config
         generators = [np.random.default_rng([seed, self.updates]) for seed in self.seeds]
         rollout = collect(
@@ -190,33 +187,30 @@ class PPO:
             record: JSON record for the checkpoint: at least `study` and `method`.
         """
         if checkpoint is not None and Path(checkpoint).is_file():
-            self.restore(checkpoint, record)
+            self.load(checkpoint, record)
         while self.updates < updates:
-            before = training_state.take(self)
+            before = self.state()
             try:
                 report = self.update()
                 if callback is not None:
                     callback({**report, "total_updates": updates})
             except KeyboardInterrupt:
-                if self.updates == int(before["updates"]):
-                    training_state.put(self, before)
+                if self.updates == before[1]["updates"]:
+                    self.restore(*before)
                 if checkpoint is not None:
                     self.save(checkpoint, record)
                 raise
             if checkpoint is not None and (self.updates % every == 0 or self.updates == updates):
                 self.save(checkpoint, record)
 
-    def save(self, path: str | Path, record: Mapping[str, Any] | None = None) -> None:
-        """Write the whole state of the training (safetensors, atomic)."""
-        training_state.save(self, path, {"ppo": asdict(self.config), **(record or {})})
+    def state(self) -> State:
+        """Weights, Adam, updates done."""
+        return learned(self.parameters, self.optimiser), {"updates": self.updates}
 
-    def restore(self, path: str | Path, record: Mapping[str, Any] | None = None) -> None:
-        """Go on from a file written by `save`.
-
-        Raises:
-            CheckpointError: if it is no such file, or of other seeds, sizes or hyperparameters.
-        """
-        training_state.restore(self, path, {"ppo": asdict(self.config), **(record or {})})
+    def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
+        """Continue from `state`."""
+        relearn(arrays, self.parameters, self.optimiser)
+        self.updates = int(record["updates"])
 
     def _environment_seeds(self, update: int) -> Any:
         """One integer for each seed, and a single one where there is a single seed."""
@@ -253,10 +247,12 @@ class PPO:
         c = self.config
         observation, privileged, action, scalars = batch.split(self._columns, -1)
         old_log_probability, advantage, target = scalars.unbind(-1)
+        spread, centre = torch.std_mean(advantage, dim=1, keepdim=True)
+        advantage = (advantage - centre) / (spread + 1e-8)
         mean, value = self.policy(observation), self.critic(privileged)
         with torch.no_grad():
             to_mean, to_log_std, ratio = surrogate_gradient(
-                mean, self.log_std, action, old_log_probability, normalised(advantage), c.clip
+                mean, self.log_std, action, old_log_probability, advantage, c.clip
             )
             error = value - target.unsqueeze(-1)
             to_value = (2.0 * c.value_weight / error.shape[1]) * error
@@ -267,3 +263,80 @@ class PPO:
         with torch.no_grad():
             self.log_std.clamp_(min=c.log_std_floor)
         return {"ratio": ratio, "value_error": error[..., 0]}
+
+
+def generalised_advantage(
+    rollout: Rollout, value: np.ndarray, following: np.ndarray, gamma: float, lam: float
+) -> np.ndarray:
+    """Generalised advantage estimate A_t = delta_t + gamma lambda A_t+1 (Schulman et al. 2016).
+
+    delta_t = r_t + gamma V(next) - V(now), where V(next) is the critic at the state that was
+    reached, also where a time limit cut the episode, and 0 only where the task ended.
+
+    Args:
+        rollout: reward, terminated and done, (S, T, E) each.
+        value: critic at the states, (S, T, E).
+        following: critic at the states reached, before any restart, (S, T, E).
+        gamma: discount factor.
+        lam: lambda.
+    """
+    delta = rollout.reward + gamma * following * ~rollout.terminated - value
+    carry = gamma * lam * ~rollout.done
+    advantage = delta.copy()
+    for t in range(delta.shape[1] - 2, -1, -1):
+        advantage[:, t] += carry[:, t] * advantage[:, t + 1]
+    return advantage
+
+
+def surrogate_gradient(
+    mean: Tensor,
+    log_std: Tensor,
+    action: Tensor,
+    old_log_probability: Tensor,
+    advantage: Tensor,
+    clip: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradient of the clipped surrogate for a Gaussian policy, by mean and log_std.
+
+    With r = p(action)/p_old(action) the loss L = -mean_m min(r A, clip(r, 1 - c, 1 + c) A) has
+
+        dL/dlog p = -r A / m   where r A is the smaller of the two, and 0 where it is clipped,
+        dlog p/dmean = x / std,   dlog p/dlog_std = x^2 - 1   with x = (action - mean) / std.
+
+    Args:
+        mean: (S, m, n).
+        log_std: (S, 1, n).
+        action: (S, m, n).
+        old_log_probability: (S, m), without the constant -n/2 log 2 pi.
+        advantage: A, (S, m).
+        clip: c.
+
+    Returns:
+        dL/dmean (S, m, n), dL/dlog_std (S, 1, n) and the ratio r (S, m).
+    """
+    precision = torch.exp(-log_std)
+    x = (action - mean) * precision
+    square = x * x
+    log_probability = -(0.5 * square + log_std).sum(-1)
+    ratio = torch.exp(log_probability - old_log_probability)
+    gain = ratio * advantage
+    active = gain <= ratio.clamp(1.0 - clip, 1.0 + clip) * advantage
+    slope = (gain * active).mul_(-1.0 / advantage.shape[1]).unsqueeze(-1)
+    return slope * (x * precision), (slope * (square - 1.0)).sum(1, keepdim=True), ratio
+
+
+def shuffle(data: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
+    """Put the rows of data (S, N, columns) in random order, each seed by its own generator."""
+    S, N, columns = data.shape
+    order = np.stack([g.permutation(N) + N * s for s, g in enumerate(generators)])
+    index = torch.from_numpy(order.reshape(-1))
+    return data.reshape(S * N, columns).index_select(0, index).reshape(S, N, columns)
+
+
+def clip_gradients(gradients: Sequence[Tensor | None], seeds: int, max_norm: float) -> None:
+    """Scale each seed's gradient, over all parameters, to a norm of at most `max_norm`."""
+    rows = [gradient.view(seeds, -1) for gradient in gradients if gradient is not None]
+    squares = torch.stack([torch.linalg.vector_norm(row, dim=1) for row in rows])
+    scale = (max_norm / (torch.linalg.vector_norm(squares, dim=0) + 1e-6)).clamp(max=1.0)
+    for row in rows:
+        row.mul_(scale.unsqueeze(1))

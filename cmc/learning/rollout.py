@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,26 +14,17 @@ from torch import Tensor, nn
 from cmc.policies import as_numpy
 
 
-@dataclass(frozen=True)
-class Rollout:
+class Rollout(NamedTuple):
     """S seeds, T steps, E trajectories a seed; all arrays start with (S, T, E)."""
 
-    observation: Tensor
-    """What the policy saw."""
-    privileged: Tensor
-    """What the critic saw at the same time."""
-    following: Tensor
-    """What the critic sees at the state that was reached, before any restart."""
-    action: Tensor
-    """Commands, noise included."""
-    noise: Tensor
-    """Standard normal noise of the commands."""
+    observation: Tensor  # what the policy saw
+    privileged: Tensor  # what the critic saw at the same time
+    following: Tensor  # what the critic sees at the state that was reached, before any restart
+    action: Tensor  # commands, noise included
+    noise: Tensor  # standard normal noise of the commands
     reward: NDArray[np.float32]
-    """Reward of each step."""
-    terminated: NDArray[np.bool_]
-    """Where the task ended: no value beyond."""
-    done: NDArray[np.bool_]
-    """Where the trajectory ended, by the task or by a time limit."""
+    terminated: NDArray[np.bool_]  # where the task ended: no value beyond
+    done: NDArray[np.bool_]  # where the trajectory ended, by the task or by a time limit
 
 
 def collect(
@@ -61,36 +51,22 @@ def collect(
     kick = noise * log_std.exp().unsqueeze(1).numpy()
     observation, info = env.reset(seed=env_seeds)
     privileged = info.get("privileged", observation)
-    d, p = observation.shape[-1], privileged.shape[-1]
-    seen = np.empty((S, steps, E, d), dtype=np.float32)
-    known, following = (np.empty((S, steps, E, p), dtype=np.float32) for _ in range(2))
-    actions = np.empty((S, steps, E, n), dtype=np.float32)
-    reward = np.empty((S, steps, E), dtype=np.float32)
-    terminated, done = (np.empty((S, steps, E), dtype=bool) for _ in range(2))
+    sizes = (observation.shape[-1], privileged.shape[-1], privileged.shape[-1], n)
+    floats = [np.empty((S, steps, E, size), dtype=np.float32) for size in sizes]
+    scalars = [np.empty((S, steps, E), dtype=kind) for kind in (np.float32, bool, bool)]
     act = as_numpy(policy)
     for t in range(steps):
-        seen[:, t] = observation.reshape(S, E, d)
-        known[:, t] = privileged.reshape(S, E, p)
-        action = act(observation.reshape(S, E, d)) + kick[:, t]
-        actions[:, t] = action
+        seen = observation.reshape(S, E, -1)
+        action = act(seen) + kick[:, t]
+        floats[0][:, t], floats[1][:, t] = seen, privileged.reshape(S, E, -1)
         observation, gain, end, limit, info = env.step(action.reshape(S * E, n))
         privileged = info.get("privileged", observation)
         reached = _before_restart(privileged, end | limit, info)
-        following[:, t] = reached.reshape(S, E, p)
-        reward[:, t] = gain.reshape(S, E)
-        terminated[:, t] = end.reshape(S, E)
-        done[:, t] = (end | limit).reshape(S, E)
-    tensor = torch.from_numpy
-    return Rollout(
-        observation=tensor(seen),
-        privileged=tensor(known),
-        following=tensor(following),
-        action=tensor(actions),
-        noise=tensor(noise),
-        reward=reward,
-        terminated=terminated,
-        done=done,
-    )
+        floats[2][:, t], floats[3][:, t] = reached.reshape(S, E, -1), action
+        for array, part in zip(scalars, (gain, end, end | limit), strict=True):
+            array[:, t] = part.reshape(S, E)
+    saw, knew, arrived, acted, kicked = (torch.from_numpy(array) for array in (*floats, noise))
+    return Rollout(saw, knew, arrived, acted, kicked, *scalars)
 
 
 def _before_restart(privileged: np.ndarray, done: np.ndarray, info: dict[str, Any]) -> np.ndarray:

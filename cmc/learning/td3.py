@@ -1,4 +1,4 @@
-"""TD3 for several seeds at once: twin critics, a delayed actor, clipped dQ/da.
+"""TD3 for several seeds at once: twin critics, a delayed actor, clipped dQ/da, and its memory.
 
 Source: Fujimoto, van Hoof, Meger, "Addressing function approximation error in actor-critic
 methods", ICML 2018, with the options that the paper's tables name (`tab:my_label`, `tab:para`).
@@ -15,11 +15,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from cmc.learning.replay import Batch
+from cmc.learning.state import Arrays, State, learned, relearn, set_streams, streams
 from cmc.policies import StackedMLP, tanh
 
+Array32 = NDArray[np.float32]
 View = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -73,7 +75,7 @@ class TD3:
 
     Args:
         actor: maps observations (seeds, batch, size) to actions in [-1, 1] (seeds, batch, action);
-            with `pull` it is tanh(actor.net(observation)).
+            with `pull` they are tanh(actor.unsquashed(observation)).
         seeds: one integer for each seed.
         observation: size of an observation.
         action: size of an action.
@@ -149,9 +151,10 @@ class TD3:
 
     def _update_actor(self, batch: Batch) -> None:
         config = self.config
-        before = self.actor.net(batch.observation) if config.pull else None  # type: ignore[operator]
-        action = self.actor(batch.observation) if before is None else tanh(before)
-        slope = self._action_gradient(batch.observation, action.detach())
+        seen, actor = batch.observation, self.actor
+        before = actor.unsquashed(seen) if config.pull else None  # type: ignore[operator]
+        action = actor(seen) if before is None else tanh(before)
+        slope = self._action_gradient(seen, action)
         clip = config.action_gradient_clip
         if clip is not None:
             slope = slope.clamp(-clip, clip)
@@ -193,54 +196,28 @@ class TD3:
                 norm = by_seed.norm(dim=1, keepdim=True)
                 by_seed.mul_((bound / norm.clamp(min=1e-12)).clamp(max=1.0))
 
-    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """All that is needed to continue: weights, targets, Adam, counter, generators.
+    def _learners(self) -> list[tuple[dict[str, nn.Parameter], torch.optim.Adam | None]]:
+        modules = (
+            ("actor", self.actor, self.actor_adam),
+            ("critics", self.critics, self.critic_adam),
+            ("target_actor", self.target_actor, None),
+            ("target_critics", self.target_critics, None),
+        )
+        return [(dict(module.named_parameters(name)), adam) for name, module, adam in modules]
 
-        Weights are taken as they are, not through `state_dict`, which shows those of positive
-        networks by absolute value and would lose the sign that Adam's moments belong to.
-        """
-        modules = (self.actor, self.critics, self.target_actor, self.target_critics)
-        arrays = {
-            f"{name}.{key}": value.detach().numpy().copy()
-            for name, module in zip(_MODULES, modules, strict=True)
-            for key, value in module.named_parameters()
-        }
-        for name, adam in (("actor_adam", self.actor_adam), ("critic_adam", self.critic_adam)):
-            for index, slots in adam.state_dict()["state"].items():
-                arrays |= {f"{name}.{index}.{k}": v.numpy().copy() for k, v in slots.items()}
-        generators = [generator.bit_generator.state for generator in self._generators]
-        return arrays, {"updates": self.updates, "generators": generators}
+    def state(self) -> State:
+        """Weights, targets, Adam, counter, random streams."""
+        arrays: Arrays = {}
+        for parameters, adam in self._learners():
+            arrays |= learned(parameters, adam)
+        return arrays, {"updates": self.updates, "streams": streams(self._generators)}
 
-    def restore(self, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> None:
+    def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
         """Continue from `state`."""
-        modules = (self.actor, self.critics, self.target_actor, self.target_critics)
-        with torch.no_grad():
-            for name, module in zip(_MODULES, modules, strict=True):
-                saved = _part(arrays, name)
-                for key, parameter in module.named_parameters():
-                    parameter.copy_(saved[key])
-        for name, adam in (("actor_adam", self.actor_adam), ("critic_adam", self.critic_adam)):
-            slots: dict[int, dict[str, Tensor]] = {}
-            for key, value in _part(arrays, name).items():
-                index, slot = key.split(".")
-                slots.setdefault(int(index), {})[slot] = value
-            adam.load_state_dict({**adam.state_dict(), "state": slots})
+        for parameters, adam in self._learners():
+            relearn(arrays, parameters, adam)
         self.updates = int(record["updates"])
-        for generator, state in zip(self._generators, record["generators"], strict=True):
-            generator.bit_generator.state = state
-
-
-_MODULES = ("actor", "critics", "target_actor", "target_critics")
-
-
-def _part(arrays: dict[str, np.ndarray], name: str) -> dict[str, Tensor]:
-    """Arrays whose name starts with `name.`, as tensors, without that prefix."""
-    start = f"{name}."
-    return {
-        key.removeprefix(start): torch.from_numpy(np.array(value))
-        for key, value in arrays.items()
-        if key.startswith(start)
-    }
+        set_streams(self._generators, record["streams"])
 
 
 @torch.no_grad()
@@ -248,3 +225,105 @@ def _move(target: nn.Module, source: nn.Module, rate: float) -> None:
     """Move the target: target <- (1 - rate) target + rate source."""
     pairs = list(zip(target.parameters(), source.parameters(), strict=True))
     torch._foreach_lerp_([t for t, _ in pairs], [s.detach() for _, s in pairs], rate)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Transitions of all seeds: observation, action, reward, next observation, continues.
+
+    Shapes are (seeds, batch, size), and (seeds, batch) for reward and continues. `continues` is 1
+    where the next state's value counts and 0 where it does not; `extra` is what else was stored.
+    """
+
+    observation: Tensor
+    action: Tensor
+    reward: Tensor
+    next_observation: Tensor
+    continues: Tensor
+    extra: Tensor
+
+
+class Replay:
+    """The last `capacity` transitions of each seed.
+
+    All seeds are written at the same pace, so one counter serves them all. Each seed draws its
+    samples from its own generator: what one seed learns does not depend on the others.
+
+    Args:
+        seeds: one integer for each seed.
+        observation: size of an observation.
+        action: size of an action.
+        capacity: transitions kept for each seed.
+        stream: separates generators that share their seeds (two levels, say).
+        extra: size of what else is stored with a transition.
+    """
+
+    def __init__(
+        self,
+        seeds: Sequence[int],
+        observation: int,
+        action: int,
+        capacity: int,
+        stream: int = 0,
+        extra: int = 0,
+    ) -> None:
+        if capacity < 1 or observation < 1 or action < 1 or extra < 0 or not seeds:
+            raise ValueError(
+                "wanted seeds and positive sizes; got "
+                f"{len(seeds)} seeds, observation {observation}, action {action}, {capacity} rows"
+            )
+        self.sizes = (observation, action, 1, observation, 1, extra)
+        self.capacity = capacity
+        self.rows: Array32 = np.zeros((len(seeds), capacity, sum(self.sizes)), dtype=np.float32)
+        self.written = 0
+        self._generators = [np.random.default_rng([seed, stream, 11]) for seed in seeds]
+
+    def __len__(self) -> int:
+        return min(self.written, self.capacity)
+
+    def add(
+        self,
+        observation: ArrayLike,
+        action: ArrayLike,
+        reward: ArrayLike,
+        next_observation: ArrayLike,
+        continues: ArrayLike,
+        extra: ArrayLike | None = None,
+    ) -> None:
+        """Add transitions (seeds, count, size); reward and continues are (seeds, count)."""
+        given = (observation, action, reward, next_observation, continues)
+        parts = [np.asarray(part, dtype=np.float32) for part in given]
+        parts[2], parts[4] = parts[2][..., None], parts[4][..., None]
+        if extra is not None:
+            parts.append(np.asarray(extra, dtype=np.float32))
+        new = np.concatenate(parts, axis=-1)
+        if new.shape[0] != len(self.rows) or new.shape[2] != self.rows.shape[2]:
+            raise ValueError(
+                f"wanted rows of {self.sizes} for {len(self.rows)} seeds; got {new.shape}"
+            )
+        where = (self.written + np.arange(new.shape[1])) % self.capacity
+        self.rows[:, where] = new
+        self.written += new.shape[1]
+
+    def sample(self, size: int) -> Batch:
+        """Draw `size` transitions of each seed, with replacement."""
+        if not len(self):
+            raise ValueError("the replay memory is empty: add transitions before sampling")
+        drawn = np.stack(
+            [generator.integers(len(self), size=size) for generator in self._generators]
+        )
+        rows = torch.from_numpy(self.rows[np.arange(len(self.rows))[:, None], drawn])
+        observation, action, reward, following, continues, extra = rows.split(self.sizes, dim=-1)
+        return Batch(observation, action, reward[..., 0], following, continues[..., 0], extra)
+
+    def state(self) -> State:
+        """The rows in use, the counter, the random streams."""
+        record = {"written": self.written, "streams": streams(self._generators)}
+        return {"rows": self.rows[:, : len(self)]}, record
+
+    def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
+        """Continue from `state`."""
+        rows = arrays["rows"]
+        self.rows[:, : rows.shape[1]] = rows
+        self.written = int(record["written"])
+        set_streams(self._generators, record["streams"])

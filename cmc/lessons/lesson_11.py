@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from cmc.envs.panda_task import PandaTask
 from cmc.learning.hierarchy import low_fields
-from cmc.learning.latent_rollout import LatentLow
-from cmc.learning.low_level import Fixed, LowLevel, ModularActor
+from cmc.learning.latent import LatentLow
+from cmc.learning.low_level import Fixed, LowLevel, latent_policy
+from cmc.policies import LinearNetwork
 from cmc.robot.panda import load_scene
 from cmc.studies import peg_maze, peg_maze_stiff
-from cmc.studies.two_level_parts import Gain, build_low
+from cmc.studies.two_level_parts import build_low
 from cmc.studies.two_level_training import marks
 
 Array = NDArray[np.float64]
@@ -129,7 +130,7 @@ def gain_step(gain: float = 10.0, axis: str = "x", regime: str = "soft") -> dict
     """
     k, low = AXES[axis], _latent_low(regime)
     limit, model = low.model.action[k], low.model
-    actor = ModularActor(Gain(np.r_[[gain / limit] * 3, np.zeros(3)]), 6)
+    actor = latent_policy(LinearNetwork(np.r_[[[gain / limit] * 2] * 3, np.zeros((3, 2))]))
     step = arm_step(Fixed(actor), axis, regime)
     predicted = _model_step(regime, np.array([gain]), k, 0.005)
     behind = np.linspace(0.0, 0.005, 51)

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmc.fast import budget
-from cmc.learning.latent_rollout import LatentLow
-from cmc.learning.low_level import Fixed, ModularActor, Segment, evaluate, set_gain
-from cmc.learning.seed_axis import single_thread
+from cmc.learning.latent import LatentLow
+from cmc.learning.low_level import Fixed, Segment, evaluate, set_gain
+from cmc.learning.state import single_thread
 from cmc.lessons.lesson_11 import MM, STUDIES
-from cmc.policies import PositiveNetwork
+from cmc.policies import ModularPolicy, PositiveNetwork
 from cmc.studies.two_level import TwoLevelStudy
 from cmc.studies.two_level_parts import build, build_low
 
@@ -81,11 +81,11 @@ def _starting(study: TwoLevelStudy, start: float) -> LatentLow:
     return low
 
 
-def _net(low: LatentLow) -> PositiveNetwork:
+def _net(low: Any) -> PositiveNetwork:
     actor = low.actor
-    assert isinstance(actor, ModularActor)
-    assert isinstance(actor.net, PositiveNetwork)
-    return actor.net
+    assert isinstance(actor, ModularPolicy)
+    assert isinstance(actor.network, PositiveNetwork)
+    return actor.network
 
 
 def _actions(actor: Any, y: Array) -> Array:

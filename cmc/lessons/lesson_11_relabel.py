@@ -20,7 +20,7 @@ from cmc.learning.hiro import (
     log_likelihood,
     subgoal_transition,
 )
-from cmc.learning.replay import Batch
+from cmc.learning.td3 import Batch
 from cmc.studies import peg_maze
 from cmc.studies.two_level_parts import build_low
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cmc.envs.peg_push import BOX_TOP, PUSH, PegPush
 from cmc.fast import budget
-from cmc.learning.seed_axis import single_thread
+from cmc.learning.state import single_thread
 from cmc.studies import peg_push
 from cmc.studies.two_level_parts import build
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from cmc.envs.peg_push import PUSH
 from cmc.fast import budget
-from cmc.learning.latent_rollout import LatentModel
+from cmc.learning.latent import LatentModel
 from cmc.learning.low_level import CriticLow, LowLevel, Segment
-from cmc.learning.seed_axis import single_thread
+from cmc.learning.state import single_thread
 from cmc.lessons.lesson_12 import LATENT, low_level
 from cmc.studies import peg_push
 from cmc.studies.two_level_evaluation import slope_at_rest

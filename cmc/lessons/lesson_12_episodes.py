@@ -13,7 +13,7 @@ from cmc.envs.peg_push import BOX_TOP, PUSH, PegPush
 from cmc.fast import budget
 from cmc.learning.hierarchy import low_fields
 from cmc.learning.low_level import evaluate
-from cmc.learning.seed_axis import single_thread
+from cmc.learning.state import single_thread
 from cmc.studies import peg_push
 from cmc.studies.two_level_evaluation import TEST_SEED, slope_at_rest
 from cmc.studies.two_level_training import marks

@@ -8,19 +8,17 @@ run as one batched product.
 
 from __future__ import annotations
 
-from cmc.policies.convex import ConvexGradientNetwork
-from cmc.policies.fast_tanh import tanh
-from cmc.policies.frozen import as_numpy
-from cmc.policies.modular import DirectPolicy, ModularPolicy
-from cmc.policies.positive import NegativeWeightError, PositiveNetwork
-from cmc.policies.stacked import StackedMLP
-from cmc.policies.unconstrained import IndependentNetwork, JointNetwork
+from cmc.policies.modular import DirectPolicy, ModularPolicy, as_numpy
+from cmc.policies.networks import LinearNetwork, NegativeWeightError, PositiveNetwork
+from cmc.policies.rivals import ConvexGradientNetwork, IndependentNetwork, JointNetwork
+from cmc.policies.stacked import StackedMLP, tanh
 
 __all__ = [
     "ConvexGradientNetwork",
     "DirectPolicy",
     "IndependentNetwork",
     "JointNetwork",
+    "LinearNetwork",
     "ModularPolicy",
     "NegativeWeightError",
     "PositiveNetwork",

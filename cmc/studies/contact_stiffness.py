@@ -29,7 +29,7 @@ import numpy as np
 
 from cmc import store
 from cmc.envs.peg_push import PegPush
-from cmc.learning.seed_axis import single_thread
+from cmc.learning.state import single_thread
 from cmc.studies.peg_push import STUDY
 from cmc.studies.two_level import TwoLevelStudy
 from cmc.studies.two_level_evaluation import Episodes, interval, run_episodes, summary

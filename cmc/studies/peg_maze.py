@@ -35,7 +35,7 @@ from functools import partial
 
 from cmc.envs.peg_maze import JOINT, SOFT, STIFF, PegMaze
 from cmc.learning.hierarchy import HierarchyConfig
-from cmc.learning.latent_rollout import LatentConfig
+from cmc.learning.latent import LatentConfig
 from cmc.learning.td3 import TD3Config
 from cmc.studies import two_level_motion, two_level_results, two_level_training
 from cmc.studies.two_level import TwoLevelStudy

@@ -20,11 +20,10 @@ from tqdm import tqdm
 
 from cmc import store
 from cmc.learning.low_level import LowLevel
-from cmc.learning.seed_axis import single_thread
+from cmc.learning.state import single_thread
 from cmc.studies.peg_push import STUDY
 from cmc.studies.two_level import TwoLevelStudy
 from cmc.studies.two_level_evaluation import TEST_SEED, run_episodes, summary
-from cmc.studies.two_level_parts import low_actor
 from cmc.studies.two_level_results import find_checkpoint
 from cmc.studies.two_level_training import load
 
@@ -60,7 +59,7 @@ def load_picked(
     for step in set(steps):
         mask = torch.tensor([own == step for own in steps])
         other, other_low, _ = load(study, name, step, path)
-        for to, source in ((planner, other), (low_actor(low), low_actor(other_low))):
+        for to, source in ((planner, other), (low.actor, other_low.actor)):
             if to is not None and source is not None:
                 _copy_seeds(to, source, mask)
     return planner, low, record

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cmc.envs.panda_config import PandaTaskConfig
 from cmc.envs.panda_task import HIGH_LEVEL, PandaTask
 from cmc.learning.hierarchy import HierarchyConfig
-from cmc.learning.latent_rollout import LatentConfig
+from cmc.learning.latent import LatentConfig
 from cmc.learning.planning import Planning
 from cmc.learning.ppo import PPOConfig
 from cmc.learning.td3 import TD3Config

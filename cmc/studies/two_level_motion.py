@@ -9,7 +9,7 @@ import numpy as np
 
 from cmc.learning.hierarchy import low_fields
 from cmc.learning.low_level import evaluate
-from cmc.learning.seed_axis import single_thread
+from cmc.learning.state import single_thread
 from cmc.studies.two_level import TwoLevelStudy
 from cmc.studies.two_level_evaluation import TEST_SEED
 from cmc.studies.two_level_training import load

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
-from cmc.learning.critic_view import CriticView
 from cmc.learning.hierarchy import HierarchyConfig, TwoLevel
 from cmc.learning.hiro import JointLow, JointUnits, Normalised, OffPolicyCorrection, PullActor
-from cmc.learning.latent_rollout import LatentLow, LatentModel
-from cmc.learning.low_level import CriticLow, Fixed, LowLevel, ModularActor, set_gain
+from cmc.learning.latent import LatentLow, LatentModel
+from cmc.learning.low_level import CriticLow, Fixed, LowLevel, latent_policy, set_gain
 from cmc.learning.one_level import OneLevelPPO, SegmentEnv
+from cmc.learning.planning import CriticView
 from cmc.learning.td3 import TD3, View
-from cmc.policies import IndependentNetwork, PositiveNetwork, StackedMLP, tanh
+from cmc.policies import (
+    DirectPolicy,
+    IndependentNetwork,
+    JointNetwork,
+    LinearNetwork,
+    PositiveNetwork,
+)
 from cmc.robot.panda import LOWER, UPPER
 from cmc.studies.two_level import Arm, TwoLevelStudy, start_joints
 
@@ -28,52 +32,13 @@ N = 6  # dimensions of a pose
 ACTOR_SIZE, CRITIC_SIZE = 2 * N, 4 * N + 1  # (y, int y), and with error, velocity, time to go
 
 
-class Trainer(Protocol):
-    """What `train` asks of a training."""
-
-    low: Any
-    planner: Any
-
-    @property
-    def steps(self) -> int:
-        """Environment steps of each seed so far."""
-
-    @property
-    def stride(self) -> int:
-        """Environment steps of each seed that `segment` takes."""
-
-    def segment(self) -> Array:
-        """Go on; mean rewards (seeds,)."""
-
-    def save(self, path: str | Path, record: Mapping[str, Any]) -> None:
-        """Write everything that decides what follows."""
-
-    def load(self, path: str | Path, record: Mapping[str, Any]) -> None:
-        """Continue from `save`."""
+Trainer = TwoLevel | OneLevelPPO
 
 
-class Planner(nn.Module):
+def Planner(inputs: int, outputs: int, hidden: Sequence[int], seeds: Sequence[int]) -> DirectPolicy:
     """Sub-goals in [-1, 1] from normalized observations."""
-
-    def __init__(self, inputs: int, outputs: int, hidden: Sequence[int], seeds: Sequence[int]):
-        super().__init__()
-        self.net = StackedMLP(inputs, outputs, hidden, seeds=seeds)
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """Actions (seeds, batch, outputs)."""
-        return tanh(self.net(observation))
-
-
-class Gain(nn.Module):
-    """u_i = tanh(g_i (y_i + integral of y_i)): a hand-tuned low level."""
-
-    def __init__(self, gain: Array) -> None:
-        super().__init__()
-        self.gain = nn.Parameter(torch.as_tensor(gain, dtype=torch.float32), requires_grad=False)
-
-    def forward(self, s: Tensor) -> Tensor:
-        """Values (seeds, batch, n) for s (seeds, batch, n, 2)."""
-        return self.gain * s.sum(-1)
+    network = JointNetwork(outputs, inputs=inputs, hidden=hidden, seeds=seeds, last=1.0)
+    return DirectPolicy(network, squash=True)
 
 
 def build_low(study: TwoLevelStudy, name: str, seeds: Sequence[int]) -> LowLevel:
@@ -86,7 +51,8 @@ def build_low(study: TwoLevelStudy, name: str, seeds: Sequence[int]) -> LowLevel
     cap = study.slope_cap(name)
     start = np.minimum(study.start_gain, 0.99 * cap)
     if arm.low == "gain":
-        return Fixed(ModularActor(Gain(start), N), N)
+        gain = LinearNetwork(np.stack([start, start], -1))
+        return Fixed(latent_policy(gain), N)
     net: nn.Module
     if arm.positive:
         limit = (np.array([1.0, study.task.tick]), cap) if arm.capped else None
@@ -96,7 +62,7 @@ def build_low(study: TwoLevelStudy, name: str, seeds: Sequence[int]) -> LowLevel
     else:
         net = IndependentNetwork(N, hidden=study.low_hidden, seeds=seeds)
     set_gain(net, start)
-    actor = ModularActor(net, N)
+    actor = latent_policy(net)
     if arm.low == "frozen":
         return Fixed(actor, N)
     if arm.low == "latent":
@@ -195,13 +161,8 @@ def _rates(config: HierarchyConfig, arm: Arm) -> HierarchyConfig:
     return config
 
 
-def low_actor(low: LowLevel) -> nn.Module | None:
-    """The network of a low level, or None."""
-    return low.agent.actor if isinstance(low, CriticLow) else getattr(low, "actor", None)
-
-
 def frozen(low: LowLevel) -> Fixed:
     """A low level as it is now, without exploration and learning."""
     if isinstance(low, JointLow):
         return Fixed(Normalised(low.agent.actor, low.units), len(low.units.start))
-    return Fixed(low_actor(low))
+    return Fixed(low.agent.actor if isinstance(low, CriticLow) else getattr(low, "actor", None))

@@ -11,7 +11,7 @@ import numpy as np
 
 from cmc import store
 from cmc.learning.low_level import Fixed
-from cmc.learning.seed_axis import single_thread
+from cmc.learning.state import single_thread
 from cmc.studies.two_level import TwoLevelStudy
 from cmc.studies.two_level_evaluation import consistency, run_episodes, slope_at_rest, summary
 from cmc.studies.two_level_training import checkpoint_path, load, marks

@@ -13,11 +13,10 @@ import torch
 from torch import nn
 
 from cmc import store
-from cmc.learning.low_level import LowLevel
-from cmc.learning.saved import interruptions
-from cmc.learning.seed_axis import single_thread
+from cmc.learning.low_level import Fixed
+from cmc.learning.state import interruptions, plain, single_thread
 from cmc.studies.two_level import Callback, TwoLevelStudy
-from cmc.studies.two_level_parts import Planner, build, frozen, low_actor
+from cmc.studies.two_level_parts import Trainer, build, frozen
 
 SAVE_EVERY = 100.0
 """Seconds of wall time between two saves of a training's state."""
@@ -83,7 +82,7 @@ def train(
             keep = last or done // every > (done - trainer.stride) // every
             if keep:
                 mark = done if last and done % every >= trainer.stride else done // every * every
-                for key, value in _weights(trainer.planner.actor, trainer.low).items():
+                for key, value in _weights(trainer).items():
                     kept[f"{mark:08d}.{key}"] = value
             try:
                 if callback is not None:
@@ -99,15 +98,13 @@ def train(
     return packed
 
 
-def _weights(planner: nn.Module, low: LowLevel) -> dict[str, np.ndarray]:
+def _weights(trainer: Trainer) -> dict[str, np.ndarray]:
     """Weights of both actors."""
-    found = {}
-    actor = low_actor(low)
-    for part, module in (("planner", planner), ("low", actor)):
-        if module is not None:
-            for key, value in module.state_dict().items():
-                found[f"{part}.{key}"] = value.numpy().copy()
-    return found
+    return {
+        f"{part}.{key}": value.numpy().copy()
+        for part, module in trainer.actors().items()
+        for key, value in module.state_dict().items()
+    }
 
 
 def _identity(record: dict[str, Any]) -> dict[str, Any]:
@@ -121,15 +118,6 @@ def _record(study: TwoLevelStudy, name: str, seeds: Sequence[int], total: int) -
     settings["task_class"] = study.task_class.__name__
     made = store.provenance(command, [int(seed) for seed in seeds])
     return {"study": study.name, "method": name, "configuration": plain(settings), **made}
-
-
-def plain(value: Any) -> Any:
-    """What JSON makes of a configuration: tuples and arrays become lists."""
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return [plain(item) for item in value] if isinstance(value, (tuple, list)) else value
 
 
 def checkpoint_path(study: TwoLevelStudy, name: str) -> Path:
@@ -148,7 +136,7 @@ def marks(study: TwoLevelStudy, name: str, path: str | Path | None = None) -> li
 
 def load(
     study: TwoLevelStudy, name: str, step: int | None = None, path: str | Path | None = None
-) -> tuple[nn.Module, LowLevel, dict[str, Any]]:
+) -> tuple[nn.Module, Fixed, dict[str, Any]]:
     """Planner and low level of all seeds as trained, and the record of the run.
 
     Args:
@@ -170,20 +158,18 @@ def load(
     trainer = build(
         replace(study, hierarchy=replace(study.hierarchy, worlds=1)), name, record["seeds"]
     )
-    planner, low = trainer.planner.actor, trainer.low
-    for part, module in (("planner", planner), ("low", low_actor(low))):
+    for part, module in trainer.actors().items():
         start = f"{mark:08d}.{part}."
         state = {
             key.removeprefix(start): torch.from_numpy(value)
             for key, value in tensors.items()
-            if key.startswith(start)
+            if key.startswith(start) and not key.endswith(".net.gain")  # once a weight
         }
-        if module is not None:
-            try:
-                module.load_state_dict(state)
-            except RuntimeError as error:
-                raise store.CheckpointError(
-                    f"{path}: the weights do not fit this study: {error}"
-                ) from error
-    assert isinstance(planner, Planner)
-    return planner.eval(), frozen(low), record
+        try:
+            module.load_state_dict(state)
+        except RuntimeError as error:
+            raise store.CheckpointError(
+                f"{path}: the weights do not fit this study: {error}"
+            ) from error
+    planner = trainer.actors()["planner"]
+    return planner.eval(), frozen(trainer.low), record

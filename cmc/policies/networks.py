@@ -1,4 +1,4 @@
-"""One positive-weight tanh network per dimension, its slopes bounded on both sides."""
+"""One network per dimension whose slopes are positive and bounded: tanh, or plain gains."""
 
 from __future__ import annotations
 
@@ -132,6 +132,39 @@ class PositiveNetwork(nn.Module):
             high = _product([weight.double() for weight in self.positive_weights()])
         shape = (self.n, 2) if self.seeds is None else (self.seeds, self.n, 2)
         return np.broadcast_to(low, shape).copy(), high.reshape(shape).numpy() + low
+
+
+class LinearNetwork(nn.Module):
+    """pi_i = k_i1 z_i + k_i2 integral of z_i with fixed gains: the control engineer's baseline.
+
+    Args:
+        gains: k, (n, 2), not part of the state dict.
+        seeds: one integer for each leading index, or None for no leading axis.
+    """
+
+    gains: Tensor
+
+    def __init__(self, gains: ArrayLike, seeds: Sequence[int] | None = None) -> None:
+        super().__init__()
+        found = torch.as_tensor(np.asarray(gains, dtype=np.float32))
+        if found.ndim != 2 or found.shape[1] != 2:
+            raise ValueError(f"wanted gains of shape (n, 2); got {tuple(found.shape)}")
+        self.n, self.seeds = len(found), None if seeds is None else len(seeds)
+        self.register_buffer("gains", found, persistent=False)
+
+    def forward(self, s: Tensor) -> Tensor:
+        """Evaluate: s (..., n, 2) to (..., n)."""
+        return (self.gains * s).sum(-1)
+
+    def jacobian(self, s: Tensor) -> Tensor:
+        """The gains, repeated over the batch: (..., n, 2)."""
+        return self.gains.expand(s.shape)
+
+    def slope_bounds(self) -> tuple[Array, Array]:
+        """The gains are both bounds, ([seeds,] n, 2) each."""
+        gains = self.gains.double().numpy()
+        gains = gains.copy() if self.seeds is None else np.tile(gains, (self.seeds, 1, 1))
+        return gains, gains.copy()
 
 
 def _product(weights: Sequence[Tensor]) -> Tensor:

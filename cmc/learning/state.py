@@ -1,0 +1,183 @@
+"""A training between two steps: its whole state in a file, its interruptions, its one thread.
+
+What is written decides everything that follows: a training that was stopped, or killed, and goes
+on from its file ends with the weights, bit for bit, of one that was not.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from cmc import store
+
+Arrays = dict[str, np.ndarray]
+State = tuple[Arrays, dict[str, Any]]
+"""Arrays by name, and what JSON can hold."""
+
+
+class Resumable:
+    """A training that can be written to a file and go on from it.
+
+    Attributes:
+        seeds: one integer for each training of the stack.
+        config: a dataclass; a file of other settings is refused.
+    """
+
+    seeds: tuple[int, ...]
+    config: Any
+
+    def state(self) -> State:
+        """Everything that decides what follows."""
+        raise NotImplementedError
+
+    def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
+        """Continue from `state`."""
+        raise NotImplementedError
+
+    def save(self, path: str | Path, record: Mapping[str, Any] | None = None) -> None:
+        """Write the state as one safetensors file, atomically.
+
+        Args:
+            path: the file.
+            record: JSON record: `study` and `method`, and what else a file must agree with.
+        """
+        arrays, state = self.state()
+        made = {"study": "none", "method": "none", **(record or {}), "seeds": list(self.seeds)}
+        whole = {**made, "kind": "training", "settings": plain(asdict(self.config)), "state": state}
+        store.save_checkpoint(path, arrays, whole)
+
+    def load(self, path: str | Path, record: Mapping[str, Any] | None = None) -> None:
+        """Go on from a file written by `save`.
+
+        Raises:
+            CheckpointError: if it is damaged, or of another training, seeds, sizes or settings.
+        """
+        arrays, found = store.load_checkpoint(path)
+        if found.get("kind") != "training":
+            raise store.CheckpointError(f"{path} holds no training state")
+        settings = plain(asdict(self.config))
+        wanted = {**plain(record or {}), "seeds": list(self.seeds), "settings": settings}
+        for key, value in wanted.items():
+            if found.get(key) != value:
+                raise store.CheckpointError(
+                    f"{path}: wanted a training with {key} {value!r}, found {found.get(key)!r}"
+                )
+        self.restore(arrays, found["state"])
+
+
+def learned(parameters: Mapping[str, nn.Parameter], adam: torch.optim.Optimizer | None) -> Arrays:
+    """Weights by name, and Adam's moments by `name/moment`.
+
+    Weights are taken as they are, not through `state_dict`, which shows those of positive networks
+    by absolute value and would lose the sign that Adam's moments belong to.
+    """
+    arrays: Arrays = {}
+    for name, parameter in parameters.items():
+        arrays[name] = parameter.detach().numpy().copy()
+        for key, moment in adam.state.get(parameter, {}).items() if adam else ():
+            arrays[f"{name}/{key}"] = moment.numpy().copy()
+    return arrays
+
+
+@torch.no_grad()
+def relearn(
+    arrays: Mapping[str, np.ndarray],
+    parameters: Mapping[str, nn.Parameter],
+    adam: torch.optim.Optimizer | None,
+) -> None:
+    """Put back what `learned` took.
+
+    Raises:
+        CheckpointError: if a weight is missing or has another shape.
+    """
+    for name, parameter in parameters.items():
+        found = arrays.get(name)
+        if found is None or found.shape != tuple(parameter.shape):
+            raise store.CheckpointError(
+                f"wanted a tensor {name!r} of shape {tuple(parameter.shape)}; "
+                f"found {None if found is None else found.shape}"
+            )
+    for name, parameter in parameters.items():
+        parameter.copy_(torch.from_numpy(arrays[name]))
+        if adam is not None:
+            adam.state.pop(parameter, None)
+            slots = under(arrays, f"{name}/")
+            if slots:  # files hold no scalars: a step count has come back as (1,)
+                shapes = {key: () if key == "step" else parameter.shape for key in slots}
+                moments = {key: torch.tensor(value) for key, value in slots.items()}
+                adam.state[parameter] = {k: v.reshape(shapes[k]) for k, v in moments.items()}
+
+
+def streams(generators: Sequence[np.random.Generator]) -> list[Any]:
+    """Where random streams stand."""
+    return [generator.bit_generator.state for generator in generators]
+
+
+def set_streams(generators: Sequence[np.random.Generator], states: Sequence[Any]) -> None:
+    """Put random streams back where they stood."""
+    for generator, state in zip(generators, states, strict=True):
+        generator.bit_generator.state = state
+
+
+def within(start: str, arrays: Mapping[str, np.ndarray]) -> Arrays:
+    """Arrays under names that begin with `start`."""
+    return {f"{start}{name}": value for name, value in arrays.items()}
+
+
+def under(arrays: Mapping[str, np.ndarray], start: str) -> Arrays:
+    """The arrays whose names begin with `start`, without it."""
+    return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}
+
+
+def plain(value: Any) -> Any:
+    """What JSON makes of a value: tuples and arrays become lists."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return [plain(item) for item in value] if isinstance(value, (tuple, list)) else value
+
+
+@contextmanager
+def interruptions() -> Iterator[Callable[[], bool]]:
+    """Hold SIGINT and SIGTERM back, so that a training stops between two steps, once it is saved.
+
+    Yields:
+        A function that tells whether one came. Outside the main thread signals stay as they are.
+    """
+    came: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(came)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def single_thread() -> Iterator[None]:
+    """Keep torch to one thread: on products this small more threads only wait for each other."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
