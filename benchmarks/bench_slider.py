@@ -1,8 +1,9 @@
 """From a key pressed on a slider to the new picture: 50 trajectories of 500 points, in Chromium.
 
-`page` is the browser's part alone (pictures computed beforehand); `lab` is a real JupyterLab on
-loopback with a kernel that computes every picture. Times count until the browser begins the frame
-after the drawn one. `ratio` compares with making a new inline matplotlib figure of the same data.
+`saved` is a notebook opened again, whose kernel knows nothing of it: pictures come from the table
+that it holds. `lab` has a kernel that computes every picture. Both are a JupyterLab on loopback.
+Times count until the browser begins the frame after the drawn one. `ratio` compares with making a
+new inline matplotlib figure of the same data.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from typing import Any
 
 import nbformat
 import numpy as np
+from nbclient import NotebookClient
+from nbformat.sign import NotebookNotary
 
 PRESSES = 40
 WATCH = """
@@ -41,7 +44,8 @@ WATCH = """
   }).observe(root, { attributes: true, attributeFilter: ["data-serial"] });
 }
 """
-NOTEBOOK = "from benchmarks.bench_slider import explorer\nexplorer()"
+NOTEBOOK = "from benchmarks.bench_slider import explorer\nexplorer(frames={})"
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def bundle(damping: float) -> dict[str, Any]:
@@ -51,12 +55,13 @@ def bundle(damping: float) -> dict[str, Any]:
     return {"t": t, "y": np.exp(-damping * t)[:, None] * np.cos(2 * t[:, None] + phase)}
 
 
-def explorer() -> Any:
+def explorer(frames: bool) -> Any:
     """Return the explorer whose slider is moved."""
     from cmc.view.sliders import explore, lines, panel, slider
 
     picture = panel(lines("t", "y"), x="time (s)", y="position (m)", ylim=(-1, 1))
-    return explore(bundle, picture, damping=slider(0.0, 2.0, 1.0), describe="Damped oscillations.")
+    damping = slider(0.0, 2.0, 1.0)
+    return explore(bundle, picture, damping=damping, frames=frames, describe="Oscillations.")
 
 
 def figure_ms() -> float:
@@ -123,27 +128,32 @@ def chromium() -> Iterator[Any]:
             browser.close()
 
 
-def measure_page(browser: Any, folder: Path) -> list[float]:
-    """Times on a page with pictures computed beforehand."""
-    from cmc.view.page import write_page
+def measure(
+    browser: Any, folder: Path, saved: bool, shot: str | None = None
+) -> tuple[list[float], float]:
+    """Times in JupyterLab, and the lag of a held key.
 
-    page = browser.new_page()
-    page.goto(write_page(explorer(), folder / "page.html", count=21).as_uri())
-    page.focus("#control")
-    return press(page)
-
-
-def measure_lab(browser: Any, folder: Path, shot: str | None = None) -> tuple[list[float], float]:
-    """Times in JupyterLab, and the lag of a held key."""
-    cell = nbformat.v4.new_code_cell(NOTEBOOK)
+    Args:
+        browser: a Chromium.
+        folder: where to put the notebook.
+        saved: whether the notebook has been run and saved elsewhere before it is opened.
+        shot: file for a picture of the page.
+    """
+    cell = nbformat.v4.new_code_cell(NOTEBOOK.format(saved))
     kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
     notebook = nbformat.v4.new_notebook(cells=[cell], metadata={"kernelspec": kernel})
+    if saved:
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        NotebookClient(notebook).execute(env=environment)
+        NotebookNotary().sign(notebook)  # as the reader's own run would be
     nbformat.write(notebook, folder / "slider.ipynb")
     with lab(folder) as address:
         page = browser.new_page(viewport={"width": 1280, "height": 900})
         page.goto(address)
         page.wait_for_selector(".jp-Notebook .jp-CodeCell", timeout=90_000)
-        execute(page)
+        if not saved:
+            execute(page)
+        page.wait_for_selector(".cmc-view canvas", timeout=90_000)
         page.focus(".noUi-handle")
         times = press(page)
         lag = hold(page)
@@ -172,11 +182,10 @@ def lab(folder: Path) -> Iterator[str]:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     token = os.urandom(16).hex()
-    root = Path(__file__).resolve().parent.parent
     command = [sys.executable, "-m", "jupyterlab", "--allow-root", "--no-browser"]
     command += ["--ServerApp.ip=127.0.0.1", f"--ServerApp.port={port}"]
     command += [f"--ServerApp.root_dir={folder}", "--LabApp.news_url="]
-    environment = {**os.environ, "JUPYTER_TOKEN": token, "PYTHONPATH": str(root)}
+    environment = {**os.environ, "JUPYTER_TOKEN": token, "PYTHONPATH": str(ROOT)}
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     server = subprocess.Popen(command, env=environment, **quiet)
     try:
@@ -192,17 +201,16 @@ def lab(folder: Path) -> Iterator[str]:
 
 
 def run(shot: str | None = None) -> Iterator[dict[str, Any]]:
-    """Yield one row for the page and one for JupyterLab; none without a browser."""
+    """Yield one row for the saved notebook and one for the live one; none without a browser."""
     if installed_browser() is None:
         print("no Chromium or Chrome on the PATH: sliders are not measured", file=sys.stderr)
         return
     figure = figure_ms()
     with tempfile.TemporaryDirectory() as name, chromium() as browser:
         folder = Path(name)
-        times = measure_page(browser, folder)
-        yield row("page", figure, times)
-        times, lag = measure_lab(browser, folder, shot)
-        yield {**row("lab", figure, times), "held_key_lag_ms": round(lag, 1)}
+        for where, saved in (("saved", True), ("lab", False)):
+            times, lag = measure(browser, folder, saved, shot)
+            yield {**row(where, figure, times), "held_key_lag_ms": round(lag, 1)}
 
 
 def row(where: str, figure: float, times: list[float]) -> dict[str, Any]:

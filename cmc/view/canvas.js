@@ -6,12 +6,37 @@
 const FONT = "13px 'DejaVu Sans', 'Segoe UI', 'Helvetica Neue', Arial, sans-serif";
 const SMALL = FONT.replace("13px", "12px");
 const TINY = FONT.replace("13px", "10px");
-const INK = "#333333";
+const LIGHT = { paper: "#ffffff", ink: "#333333", faint: "#999999", grid: "#e4e4e4",
+  axis: "#555555", cell: 247 };
+const DARK = { paper: "#1b1e23", ink: "#d6dae0", faint: "#7d8590", grid: "#3a3f47",
+  axis: "#9aa2ad", cell: 40 };
 const LETTERS = {
   alpha: "α", beta: "β", gamma: "γ", delta: "δ", lambda: "λ", Lambda: "Λ", mu: "μ", omega: "ω",
   Omega: "Ω", phi: "φ", pi: "π", rho: "ρ", sigma: "σ", tau: "τ", theta: "θ", Theta: "Θ",
   partial: "∂", int: "∫", cdot: "·", le: "≤", ge: "≥", times: "×", ",": " ",
 };
+
+// ---- theme: that of the page, told from the color of its text
+
+let theme = LIGHT;
+
+function brightness(color) {
+  const [r, g, b] = color;
+  return 0.3 * r + 0.59 * g + 0.11 * b;
+}
+
+function themeOf(node) {
+  const text = getComputedStyle(node).color.match(/[\d.]+/g).map(Number);
+  return brightness(text) > 140 ? DARK : LIGHT;
+}
+
+// Colors too dark for a dark page become lighter.
+function shown(color) {
+  if (theme === LIGHT || !/^#[0-9a-f]{6}$/i.test(color ?? "")) return color;
+  const parts = [1, 3, 5].map((k) => parseInt(color.slice(k, k + 2), 16));
+  const share = Math.max(0, Math.min(0.85, (110 - brightness(parts)) / 90));
+  return `rgb(${parts.map((c) => Math.round(c + share * (255 - c))).join(",")})`;
+}
 
 // ---- text: `$y_1$`, `$\Lambda_{11}$` as runs of plain, raised and lowered pieces
 
@@ -125,18 +150,18 @@ class Axes {
     const { left, top, right, bottom } = this.box;
     const xs = ticks(this.x0, this.x1, (right - left) / 55);
     const ys = this.log ? logTicks(this.y0, this.y1) : ticks(this.y0, this.y1, (bottom - top) / 45);
-    ctx.strokeStyle = "#E4E4E4";
+    ctx.strokeStyle = theme.grid;
     ctx.lineWidth = 1;
     ctx.beginPath();
     for (const v of xs) { ctx.moveTo(this.x(v), top); ctx.lineTo(this.x(v), bottom); }
     const height = (v) => bottom - (v - this.y0) * this.sy;
     for (const v of ys) { ctx.moveTo(left, height(v)); ctx.lineTo(right, height(v)); }
     ctx.stroke();
-    ctx.strokeStyle = "#555555";
+    ctx.strokeStyle = theme.axis;
     ctx.beginPath();
     ctx.moveTo(left, top); ctx.lineTo(left, bottom); ctx.lineTo(right, bottom);
     ctx.stroke();
-    ctx.fillStyle = INK;
+    ctx.fillStyle = theme.ink;
     for (const v of xs) drawText(ctx, tickText(v, false), this.x(v), bottom + 16, "center", SMALL);
     for (const v of ys) drawText(ctx, tickText(v, this.log), left - 6, height(v) + 4, "right", SMALL);
     this.labels(ctx, panel);
@@ -144,7 +169,7 @@ class Axes {
 
   labels(ctx, panel) {
     const { left, top, right, bottom } = this.box;
-    ctx.fillStyle = INK;
+    ctx.fillStyle = theme.ink;
     drawText(ctx, panel.x, (left + right) / 2, bottom + 35, "center");
     ctx.save();
     ctx.translate(15, (top + bottom) / 2);
@@ -280,30 +305,42 @@ function marker(ctx, shape, x, y, r) {
 function mix(value, limit) {
   const share = Math.max(-1, Math.min(1, value / limit)) * 0.75;
   const strong = share < 0 ? [224, 130, 20] : [94, 76, 154];
-  return `rgb(${strong.map((c) => Math.round(247 + (c - 247) * Math.abs(share))).join(",")})`;
+  const base = theme.cell;
+  return `rgb(${strong.map((c) => Math.round(base + (c - base) * Math.abs(share))).join(",")})`;
 }
 
 function drawCells(ctx, panel, layer, get, cursor, width, height) {
   const [rows, columns] = layer.values.shape.slice(-2);
   let values = get(layer.values);
+  // One scale for all times, so that a color keeps its meaning while the time runs.
+  const limit = layer.limit
+    ?? values.reduce((a, v) => (Number.isFinite(v) ? Math.max(a, Math.abs(v)) : a), 1e-30);
   if (layer.values.shape.length === 3) {
     const at = Math.min(cursor ?? layer.values.shape[0] - 1, layer.values.shape[0] - 1);
     values = values.subarray(at * rows * columns, (at + 1) * rows * columns);
   }
-  const top = panel.title ? 34 : 8, side = Math.min((width - 16) / columns, (height - top - 8) / rows);
-  const left = (width - side * columns) / 2;
-  const limit = values.reduce((a, v) => (Number.isFinite(v) ? Math.max(a, Math.abs(v)) : a), 1e-30);
+  const top = panel.title ? 34 : 8, below = panel.x ? 26 : 8, beside = panel.y ? 26 : 8;
+  const side = Math.min((width - beside - 8) / columns, (height - top - below) / rows);
+  const left = beside + (width - beside - 8 - side * columns) / 2;
   for (let k = 0; k < values.length; k++) {
     const x = left + side * (k % columns), y = top + side * Math.floor(k / columns);
-    const zero = Math.abs(values[k]) <= 1e-6 * limit;
+    const none = Number.isNaN(values[k]), zero = none || Math.abs(values[k]) <= 1e-6 * limit;
     ctx.fillStyle = mix(zero ? 0 : values[k], limit);
-    ctx.fillRect(x + 1, y + 1, side - 2, side - 2);
-    ctx.fillStyle = zero ? "#999999" : "#111111";
-    const text = zero ? "0" : String(+values[k].toPrecision(2)).replace("-", "−");
+    if (!none) ctx.fillRect(x + 1, y + 1, side - 2, side - 2);
+    ctx.fillStyle = zero ? theme.faint : theme.ink;
+    const written = zero ? "0" : String(+values[k].toPrecision(2)).replace("-", "−");
+    const text = none ? "–" : written;
     drawText(ctx, text, x + side / 2, y + side / 2 + 4, "center");
   }
-  ctx.fillStyle = INK;
+  ctx.fillStyle = theme.ink;
   if (panel.title) drawText(ctx, panel.title, 8, 19);
+  if (panel.x) drawText(ctx, panel.x, left + side * columns / 2, top + side * rows + 18, "center");
+  if (!panel.y) return;
+  ctx.save();
+  ctx.translate(left - 10, top + side * rows / 2);
+  ctx.rotate(-Math.PI / 2);
+  drawText(ctx, panel.y, 0, 0, "center");
+  ctx.restore();
 }
 
 // The corner of the axes in which the fewest points lie under the legend.
@@ -334,12 +371,12 @@ function drawLegend(ctx, ax, layers, get) {
   const width = Math.max(...named.map((layer) => textWidth(ctx, layer.label, SMALL))) + 34;
   const [x, y] = legendCorner(ax, layers, get, width, 18 * named.length + 4);
   ctx.globalAlpha = 0.82;
-  ctx.fillStyle = "white";
+  ctx.fillStyle = theme.paper;
   ctx.fillRect(x, y, width, 18 * named.length + 4);
   ctx.globalAlpha = 1;
   named.forEach((layer, k) => {
     const cy = y + 18 * k + 11;
-    ctx.fillStyle = ctx.strokeStyle = layer.color;
+    ctx.fillStyle = ctx.strokeStyle = shown(layer.color);
     ctx.lineWidth = 2.2;
     if (layer.kind === "points") marker(ctx, layer.marker ?? "dot", x + 14, cy, 4);
     else if (layer.kind === "band" || layer.kind === "shade") {
@@ -349,7 +386,7 @@ function drawLegend(ctx, ax, layers, get) {
       ctx.beginPath(); ctx.moveTo(x + 4, cy); ctx.lineTo(x + 24, cy); ctx.stroke();
       ctx.setLineDash([]);
     }
-    ctx.fillStyle = INK;
+    ctx.fillStyle = theme.ink;
     drawText(ctx, layer.label, x + 29, cy + 4, "left", SMALL);
   });
 }
@@ -367,7 +404,7 @@ function drawPanel(canvas, panel, get, cursor) {
   ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
   ctx.globalAlpha = 1;
   ctx.lineJoin = "round";
-  ctx.fillStyle = "white";
+  ctx.fillStyle = theme.paper;
   ctx.fillRect(0, 0, width, height);
   const matrix = panel.layers.find((layer) => layer.kind === "cells");
   if (matrix) {
@@ -382,7 +419,7 @@ function drawPanel(canvas, panel, get, cursor) {
   ctx.rect(left, top, right - left, bottom - top);
   ctx.clip();
   for (const layer of panel.layers) {
-    ctx.fillStyle = ctx.strokeStyle = layer.color;
+    ctx.fillStyle = ctx.strokeStyle = shown(layer.color);
     ctx.globalAlpha = 1;
     draw[layer.kind](ctx, ax, layer, get, cursor);
   }
@@ -407,6 +444,14 @@ function floats(data) {
   return new Float32Array((data.buffer ?? data).slice(start, start + data.byteLength));
 }
 
+// The handles of ipywidgets' sliders have no name of their own: the label beside them is it.
+function nameHandles() {
+  for (const handle of document.querySelectorAll(".widget-slider .noUi-handle:not([aria-label])")) {
+    const label = handle.closest(".widget-slider").querySelector(".widget-label");
+    if (label?.textContent) handle.setAttribute("aria-label", label.textContent);
+  }
+}
+
 class View {
   constructor(model, el) {
     this.model = model;
@@ -414,8 +459,10 @@ class View {
     this.row = element("div", "cmc-panels", this.root);
     this.controls = element("div", "cmc-time", this.root);
     this.status = element("div", "cmc-status", this.root);
+    this.note = element("div", "cmc-note", this.root);
     this.alert = element("div", "cmc-error", this.root);
     this.status.setAttribute("aria-live", "polite");
+    this.note.setAttribute("role", "status");
     this.alert.setAttribute("role", "alert");
     this.canvases = [];
     this.cursor = null;
@@ -424,10 +471,17 @@ class View {
     this.addControls();
     this.onFrame = () => this.request();
     this.onError = () => this.showError();
+    // Pages switch between light and dark by attributes of their root or body.
+    this.watch = new MutationObserver(() => this.request());
+    for (const node of [document.documentElement, document.body]) {
+      this.watch.observe(node, { attributes: true });
+    }
     model.on("change:frame", this.onFrame);
     model.on("change:error", this.onError);
-    this.draw();
+    model.on("change:note", this.onError);
+    requestAnimationFrame(() => this.draw());  // in the page by then, and of its colors
     this.showError();
+    for (const wait of [0, 500, 3000]) setTimeout(nameHandles, wait);
   }
 
   addControls() {
@@ -485,6 +539,7 @@ class View {
       this.data = floats(frame.data);
       this.layout(frame);
     }
+    theme = themeOf(this.root);
     const get = ({ at, shape }) => this.data.subarray(at, at + shape.reduce((a, b) => a * b, 1));
     frame.panels.forEach((panel, k) => drawPanel(this.canvases[k], panel, get, this.cursor));
     if (frame.time && this.cursor !== null) {
@@ -522,14 +577,18 @@ class View {
     const error = this.model.get("error");
     this.alert.textContent = error;
     this.alert.hidden = !error;
-    this.row.classList.toggle("cmc-stale", Boolean(error));
+    this.note.textContent = this.model.get("note") ?? "";
+    const stale = this.note.textContent && !this.model.get("table")?.words;
+    this.row.classList.toggle("cmc-stale", Boolean(error || stale));
   }
 
   remove() {
     this.stop();
+    this.watch.disconnect();
     if (this.requested) cancelAnimationFrame(this.requested);
     this.model.off("change:frame", this.onFrame);
     this.model.off("change:error", this.onError);
+    this.model.off("change:note", this.onError);
     this.root.remove();
   }
 }
@@ -539,4 +598,4 @@ function render({ model, el }) {
   return () => view.remove();
 }
 
-export default { render };
+export default { initialize, render };

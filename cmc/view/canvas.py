@@ -16,14 +16,18 @@ from cmc.view.picture import Panel, encode, panel
 from cmc.view.style import CYCLE
 
 _FOLDER = Path(__file__).parent
-SCRIPT, STYLE = _FOLDER / "canvas.js", _FOLDER / "canvas.css"
+STYLE = _FOLDER / "canvas.css"
+SCRIPT = "".join((_FOLDER / name).read_text("utf-8") for name in ("frames.js", "canvas.js"))
+"""The widget's module: `frames.js` and `canvas.js` in one."""
 
 
 class Canvas(anywidget.AnyWidget):
     """Panels drawn by the browser from arrays that the kernel sends.
 
     A frame is sent whole; the browser draws the newest one at its next repaint, so that frames
-    which arrive faster than they can be drawn are skipped.
+    which arrive faster than they can be drawn are skipped. Without a kernel the pictures of `table`
+    (`frames.py`) follow the widgets named in `controls`; without those, `note` says that the
+    picture is stale.
     """
 
     _esm = SCRIPT
@@ -31,6 +35,10 @@ class Canvas(anywidget.AnyWidget):
     frame = traitlets.Dict().tag(sync=True)
     description = traitlets.Unicode().tag(sync=True)
     error = traitlets.Unicode().tag(sync=True)
+    note = traitlets.Unicode().tag(sync=True)
+    controls = traitlets.List(traitlets.Unicode()).tag(sync=True)
+    values: traitlets.List[Any] = traitlets.List().tag(sync=True)
+    table: traitlets.Dict[str, Any] = traitlets.Dict().tag(sync=True)
 
     def __init__(
         self, panels: Sequence[Panel], description: str, time: Source | None = None
@@ -46,11 +54,15 @@ class Canvas(anywidget.AnyWidget):
         Raises:
             PictureError: if the data do not fit the layers; nothing is sent then.
         """
-        frame = encode(self._panels, data, self._time)
+        frame = self.encode(data)
         self._serial += 1
         with self.hold_sync():
             self.frame = {"serial": self._serial, **frame}
             self.error = ""
+
+    def encode(self, data: Data) -> dict[str, Any]:
+        """The frame that shows `data`."""
+        return encode(self._panels, data, self._time)
 
     def fail(self, message: str) -> None:
         """Show an error beside the picture, which is kept but grayed."""

@@ -167,10 +167,14 @@ def band(x: Source, low: Source, high: Source, *, color: str | None = None, **lo
     return Layer("band", fetch, _look(color, {"alpha": 0.2, **look}, "label", "alpha"))
 
 
-def cells(M: Source) -> Layer:
+def cells(M: Source, limit: float | None = None) -> Layer:
     """A matrix as colored, written cells: (rows, columns), or (time, rows, columns).
 
-    Put it alone in a panel; the axes count columns and rows.
+    Put it alone in a panel. NaN is an empty cell.
+
+    Args:
+        M: the matrix.
+        limit: magnitude of the strongest color; the largest entry (of all times) by default.
     """
 
     def fetch(data: Data) -> dict[str, np.ndarray]:
@@ -181,7 +185,7 @@ def cells(M: Source) -> Layer:
         corners = {"x": np.array([0.5, columns + 0.5]), "y": np.array([0.5, rows + 0.5])}
         return {"values": A, **corners}
 
-    return Layer("cells", fetch, {})
+    return Layer("cells", fetch, {"limit": limit})
 
 
 def shade(

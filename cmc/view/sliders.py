@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import os
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ import ipywidgets as widgets
 import numpy as np
 
 from cmc.view.canvas import Canvas, LiveCurve
+from cmc.view.frames import frame_table
 from cmc.view.layers import Source, arrows, band, cells, lines, paths, points, rule, shade
 from cmc.view.picture import Panel, panel
 
@@ -71,6 +73,14 @@ class Slider:
         """Values that the callback must survive: the ends."""
         return [self.low, self.high]
 
+    @property
+    def values(self) -> list[Any]:
+        """All values that the control can have, its start among them, in order."""
+        count = int(np.ceil((self.high - self.low) / self.step - 1e-9)) + 1
+        steps = {min(self.low + k * self.step, self.high) for k in range(count)}
+        near = {v for v in steps if abs(v - self.start) < 1e-9 * (self.high - self.low)}
+        return sorted(steps - near | {self.start})
+
     def widget(self, name: str, *, slow: bool) -> widgets.ValueWidget:
         """Return the control, labeled by its unit."""
         unit = f" ({self.unit})" if self.unit else ""
@@ -99,15 +109,25 @@ class Choice:
     label: str
 
     @property
+    def is_box(self) -> bool:
+        """Whether a check box shows it."""
+        return len(self.options) == 2 and all(isinstance(o, bool) for o in self.options)
+
+    @property
     def probes(self) -> list[Any]:
         """Values that the callback must survive: all of them."""
         return list(self.options)
+
+    @property
+    def values(self) -> list[Any]:
+        """All values that the control can have, in order; a box is off, then on."""
+        return [False, True] if self.is_box else list(self.options)
 
     def widget(self, name: str, *, slow: bool) -> widgets.ValueWidget:
         """Return the control: a check box for two truth values, a list otherwise."""
         kind: Any = widgets.Dropdown
         more: dict[str, Any] = {"options": self.options}
-        if set(self.options) == {False, True}:
+        if self.is_box:
             kind, more = widgets.Checkbox, {"indent": True}
         return kind(
             value=self.start,
@@ -191,6 +211,7 @@ class Explorer(widgets.VBox):
         describe: str,
         time: Source | None = None,
         slow: bool = False,
+        frames: bool = False,
     ) -> None:
         if not controls:
             raise ValueError("wanted at least one slider")
@@ -210,6 +231,12 @@ class Explorer(widgets.VBox):
             widget.observe(self._changed, "value")
         row = widgets.Box([*self.controls.values(), self._reset], layout={"flex_flow": "row wrap"})
         super().__init__([row, self.canvas])
+        # What the page needs to go on without a kernel, or to say that it cannot.
+        self.canvas.controls = [widget.model_id for widget in self.controls.values()]
+        kinds = controls.values()
+        self.canvas.values = [c.values if isinstance(c, Slider) else None for c in kinds]
+        if frames:
+            self.canvas.table = self._table(controls)
 
     @property
     def values(self) -> dict[str, Any]:
@@ -226,6 +253,20 @@ class Explorer(widgets.VBox):
         data = self.callback(**{**self.values, **values})
         self.canvas.show(data)
         return data
+
+    def _table(self, controls: Mapping[str, Control]) -> dict[str, Any]:
+        """Pictures for all positions of the controls; those that fail hold the error."""
+        values = [control.values for control in controls.values()]
+        starts = [v.index(c.start) for v, c in zip(values, controls.values(), strict=True)]
+
+        def picture(*index: int) -> dict[str, Any]:
+            chosen = {name: v[k] for name, v, k in zip(controls, values, index, strict=True)}
+            try:
+                return self.canvas.encode(self.callback(**chosen))
+            except Exception as error:
+                return {"error": "".join(traceback.format_exception_only(error)).strip()}
+
+        return frame_table(values, starts, picture)
 
     def reset(self) -> None:
         """Move every control back to its first value."""
@@ -260,6 +301,7 @@ def explore(
     describe: str,
     time: Source | None = None,
     slow: bool = False,
+    frames: bool | None = None,
     **controls: Control,
 ) -> Explorer:
     """Show a picture that follows sliders.
@@ -275,9 +317,14 @@ def explore(
         time: key of the times (m,), s, of a time cursor: layers with `head` and dots or cells of
             shape (time, ...) follow it, and a button plays the motion.
         slow: answer only when a slider is released, and try fewer values at first.
+        frames: also make the pictures of all positions of the controls (`frames.py`), so that
+            exported HTML, a static site and a reopened notebook are live without a kernel; only
+            where the environment variable CMC_EXPORT is 1 by default, as it takes its time.
         controls: parameter name to `slider`, `choice` or `toggle`.
     """
-    return Explorer(callback, panels, controls, describe, time, slow)
+    if frames is None:
+        frames = os.environ.get("CMC_EXPORT", "0") not in ("", "0")
+    return Explorer(callback, panels, controls, describe, time, slow, frames)
 
 
 def probes(controls: Mapping[str, Control], *, corners: bool) -> Iterator[dict[str, Any]]:
