@@ -33,8 +33,8 @@ def my_plant():
     f_y, f_u = [[-1.0, 0.5], [0.2, -3.0]], [[1.0, 0.3], [0.4, 2.0]]
     floor, ceiling = np.array([[0.5, 0.3]] * 2), np.array([[2.0, 1.0]] * 2)
     interval = SimpleNamespace(slope_bounds=lambda: (floor, ceiling))
-    low, high = 0.01, 5.0
-    for _ in range(12):
+    low, high = 0.2, 2.0
+    for _ in range(7):
         h = (low + high) / 2
         low, high = (h, high) if certify(interval, LinearPlant(f_y, f_u), h=h) else (low, h)
     return f_y, f_u, floor, ceiling, low
