@@ -1,129 +1,176 @@
-"""Lesson 06: what its pictures show is true, and its exercise tells right from wrong."""
+"""Lesson 06: what its cells show is true, for its gains and for others."""
 
 import numpy as np
 import pytest
+from lesson import lesson, run
 
 from cmc import exercises
-from cmc.lessons import latent_arm, lesson_06
 from cmc.theory.composite import composite
 
-
-def test_error_motion_is_the_exact_solution():
-    t = np.linspace(0, 1, 101)
-    path = lesson_06.error_motion(40.0, 20.0, 1.0, np.array([1.0, 0.0]), t)
-    p, q = np.sort(np.roots([1, 20, 40]).real)
-    exact = (p * np.exp(q * t) - q * np.exp(p * t)) / (p - q)
-    np.testing.assert_allclose(path[:, 0], exact, atol=1e-10)
+GAINS = """
+K_p, K_d = np.array({K_p}), np.array({K_d})
+lambda_d = {lam}
+arm = TwoLinkArm(lengths=(0.5, 0.4), masses=(2.0, 1.0))
+"""
 
 
-@pytest.mark.parametrize("root", ["small", "large"])
-def test_point_mass_shows_y_on_its_envelope(root):
-    shown = lesson_06.point_mass(40.0, 20.0, 1.0, root)
-    np.testing.assert_allclose(shown["y"], shown["latent"], atol=1e-9)
+@pytest.fixture(scope="module")
+def whole():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CMC_FAST", "1")
+        return run("06")
 
 
-def test_point_mass_in_the_infeasible_zone_says_so_and_rings():
-    shown = lesson_06.point_mass(40.0, 5.0)
-    assert "refused" in shown["text"]
-    assert "12.65" in shown["text"]
-    assert np.isnan(shown["y"]).all()
-    assert shown["e"].min() < -0.05
-    assert (np.abs(shown["edge"][:, 1] ** 2 - 4 * shown["edge"][:, 0]) < 1e-9).all()
+@pytest.fixture(scope="module")
+def demo():
+    return lesson("06")
 
 
-def test_wrong_composition_converges_in_y_and_diverges_in_e():
-    run = lesson_06.wrong_composition()
-    assert abs(run["y"][-1]) < 0.06 * run["y"][0]
-    assert run["e"][-1] > 5 * run["e"][0]
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_formula_of_the_cell_is_the_library_and_fits_the_error_equation(demo, sign):
+    for K_p, K_d, lam in ((40.0, 20.0, 1.0), (3.0, 8.0, 2.0), (20.0, 30.0, 0.5)):
+        K1, K2, A, B = demo["mixture"](K_p, K_d, lam, sign)
+        np.testing.assert_allclose([A * K2, A * K1 + B * K2, B * K1], [lam, K_d, K_p])
+        m = composite(K_p, K_d, lam, "small" if sign == 1 else "large")
+        np.testing.assert_allclose([K1, K2, A, B], [m.K1, m.K2, m.A_lat, m.B_lat])
+    with pytest.raises(ValueError, match=r"at least 12\.6"):
+        demo["mixture"](40.0, 12.0)
 
 
-def test_hierarchy_decays_at_the_rates_of_the_model():
-    run = lesson_06.hierarchy("small")
-    np.testing.assert_allclose(
-        run["y"] / run["y"][0], run["latent"][:, None] * np.ones(39), rtol=1e-6
-    )
-    late = run["e"][-1] / run["e"][150]
-    np.testing.assert_allclose(late, run["latent"][-1] / run["latent"][150], rtol=0.02)
+def test_the_wrong_mixture_converges_in_y_and_runs_away_in_e(whole):
+    A = np.array([[3.0, -3.0], [0.0, -2.0]])  # the cell's matrix: e' = 3 (e - y), y' = -2 y
+    e, y = whole.space["linear_flow"](A, np.array([0.0, 1.5]), [0.7, 1.0])[-1]
+    assert y < 0.06
+    assert e > 5.0
+    # on the path y = e - e'/3
+    assert np.allclose(A[0] @ [e, y], 3 * (e - y))
 
 
-def test_velocity_only_leaves_positions_apart():
-    run = lesson_06.velocity_only()
-    assert np.abs(run["y"][-1]).max() < 1e-3
-    assert np.ptp(run["e"][-1]) > 0.5
+def test_differences_decay_at_the_latent_rate(whole):
+    K_p, K_d = 40.0, 20.0
+    poles = np.sort(np.roots([1.0, K_d, K_p]))
+    rate = whole.space["B"] / whole.space["A"]
+    assert -rate == pytest.approx(poles[1])
+    np.testing.assert_allclose(whole.space["change"], rate, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("slope", "one"), [(5.0, True), (-0.5, True), (-3.0, False)])
-def test_policy_slopes_decide_between_one_group_and_two(slope, one):
-    assert (lesson_06.policy_loop(slope)["spread"] < 1.0) == one
+@pytest.mark.parametrize(("factor", "one"), [(5.0, True), (-0.5, True), (-3.0, False)])
+def test_slopes_decide_between_one_group_and_two(whole, factor, one):
+    y = whole.space["tanh_policy"](factor * whole.space["B"])[1]
+    assert (np.ptp(y[-1]) < 1.0) == one
+
+
+def test_alternation_begins_after_one_and_rules_before_two(whole):
+    text = whole.text
+    assert "a negative eigenvalue from 1.14 on; it is the larger one from 1.76 on;" in text
+    assert "at 2.00 it reaches -1" in text
+    # a level between 1 and 1.14: the velocity does not alternate
+    g = (1.05 / 0.02 - 20) / composite(40.0, 20.0).K2
+    step, s, signs = whole.space["held_step"](g, 0.02), np.array([1.0, 0.0]), []
+    for _ in range(40):
+        s = step @ s
+        signs.append(np.sign(s[1]))
+    assert np.sum(np.diff(signs) != 0) == 0
 
 
 @pytest.mark.parametrize("dt_ms", [5.0, 20.0, 40.0])
-def test_chatter_starts_at_the_level_two(dt_ms):
+def test_the_verdict_turns_at_the_level_two(whole, dt_ms):
     cap = float(composite(40.0, 20.0).slope_cap(dt_ms * 1e-3))
-    for share, stable in ((0.98, True), (1.02, False)):
-        run = lesson_06.chatter(share * cap, dt_ms)
-        assert (run["level"] < 2) == (run["radius"] < 1) == stable
-        assert np.isfinite(run["v"]).all()
+    for share, word in ((0.98, "settles"), (1.02, "diverges")):
+        assert word in whole.space["held"](share * cap, dt_ms, 40.0, 20.0)["text"]
 
 
-def test_arm_follows_its_latent_model_and_any_positive_network_contracts():
-    starts = latent_arm.ring_of_starts(4)
-    for policy in (latent_arm.no_policy, latent_arm.positive_policy(3)):
-        run = latent_arm.tracking(policy, starts)
-        assert np.abs(run["y"] - run["y_model"]).max() < 0.03 * np.abs(run["y"]).max()
-        spread = np.linalg.norm(run["tip"] - run["tip"].mean(axis=1, keepdims=True), axis=-1)
-        assert spread[-1].max() < 0.02 * spread[0].max()
+def test_the_arm_follows_the_model_of_gains(whole):
+    assert whole.space["off"] < 0.05
+    e, y, u = whole.space["follow"](lambda s: 5.0 * s[..., 0])
+    assert np.abs(y - whole.space["by_gains"](y[0], u)).max() < 0.05 * np.abs(y).max()
 
 
-def test_the_wrong_sign_does_not_track():
-    run = latent_arm.tracking(
-        latent_arm.positive_policy(0, sign=-1.0), latent_arm.ring_of_starts(3)
+def test_untrained_policies_in_their_true_order(whole):
+    left = {name: line[-1] for name, line in whole.space["worst"].items()}
+    assert left["linear, at the caps"] < 0.05 * left["network by hand"]
+    assert left["no policy"] < 0.3 * min(left["network as drawn"], left["same, no biases"])
+    assert left["wrong sign"] > 50
+
+
+def test_the_order_is_that_of_another_seed_too(whole):
+    seed = 2
+
+    def left(policy):
+        return np.linalg.norm(whole.space["follow"](policy)[0][-1], axis=-1).max()
+
+    networks = whole.space["networks"]
+    assert left(networks(seed, 0.5, lambda k: 2 / k)) > left(whole.space["policies"]["no policy"])
+    assert left(networks(seed, 0.0, lambda k: 0.8)) > left(
+        whole.space["policies"]["linear, at the caps"]
     )
-    assert np.linalg.norm(run["e"][-1], axis=-1).min() > 0.06
 
 
-def test_policies_are_positive_and_odd():
-    policy = latent_arm.positive_policy(0)
-    s = np.random.default_rng(0).normal(size=(200, 2, 2))
-    np.testing.assert_allclose(policy(-s), -policy(s), atol=1e-12)
-    for j, cap in enumerate(latent_arm.SLOPES):
-        step = np.zeros(2)
-        step[j] = 1e-4
-        slope = (policy(s + step) - policy(s)) / 1e-4
+def test_networks_are_positive_and_capped(whole):
+    policy = whole.space["networks"](5, 0.3, lambda k: 0.8)
+    s = np.random.default_rng(0).normal(size=(100, 2, 2))
+    for j, cap in enumerate(whole.space["caps"]):
+        step = 1e-4 * np.eye(2)[j]
+        slope = (policy(s + step) - policy(s - step)) / 2e-4
         assert slope.min() > 0
         assert slope.max() < 1.001 * cap
 
 
-def test_learning_recovers_the_gains_where_they_are_right_and_beats_them_where_not():
-    right, wrong = latent_arm.model_errors(0.0), latent_arm.model_errors(0.3)
-    np.testing.assert_allclose(right["fit"].f_u, np.diag(right["model"].f_u), atol=0.05)
-    np.testing.assert_allclose(right["fit"].f_y, np.diag(right["model"].f_y), atol=0.05)
-    assert right["gains"] < 0.02
-    assert wrong["learned"] < 0.5 * wrong["gains and a constant"] < wrong["gains"]
+def test_learning_finds_the_gains_where_they_are_right_and_beats_them_where_not(whole):
+    f_y, f_u, f_0 = whole.space["fit"](*whole.space["excite"](0.0, 300))
+    np.testing.assert_allclose(np.diag(f_u), whole.space["latent"].f_u, rtol=0.05)
+    np.testing.assert_allclose(np.diag(f_y), whole.space["latent"].f_y, rtol=0.05)
+    wrong = whole.space["unexplained"](0.3)
+    assert wrong["learned"] < 0.5 * wrong["gains and a constant"] < 0.5 * wrong["gains"]
+    f_y, f_u, _ = whole.space["fit"](*whole.space["excite"](0.3, 300))
+    for M in (f_y, f_u):
+        assert np.abs(M - np.diag(np.diag(M))).max() < 0.12 * np.abs(np.diag(M)).min()
 
 
-def test_more_data_learn_better():
-    error = lesson_06.data_needed(seeds=6)["error"].mean(axis=0)
-    assert error[-1] < 0.25 * error[0]
+def test_the_error_falls_as_one_over_the_root(whole):
+    assert -0.75 < whole.space["power"] < -0.35
 
 
-def test_exercise_refuses_the_small_root_the_wrong_scale_and_silence():
-    def small(K_p, K_d, lambda_d):
-        m = composite(K_p, K_d, lambda_d)
-        return m.K1, m.K2, m.A_lat, m.B_lat
+def test_other_gains_give_their_own_figures():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CMC_FAST", "1")
+        other = run("06", plant=GAINS.format(K_p=[12.0, 30.0, 5.0], K_d=[8.0, 25.0, 9.0], lam=1.2))
+    assert "it uses the first ones" in other.text
+    poles = np.sort(np.roots([1.2, 8.0, 12.0]).real)
+    assert other.space["B"] / other.space["A"] == pytest.approx(-poles[1])
+    np.testing.assert_allclose(other.space["change"], -poles[1], rtol=1e-5)
+    assert other.space["off"] < 0.05
+    assert "at 2.00 it reaches -1" in other.text
 
-    def large(K_p, K_d, lambda_d):
-        m = composite(K_p, K_d, lambda_d, root="large")
-        return m.K1, m.K2, m.A_lat, m.B_lat
 
-    def scaled(K_p, K_d, lambda_d):
-        K1, K2, A, B = large(K_p, K_d, lambda_d)
-        return 2 * K1, 2 * K2, A / 2, B / 2
+@pytest.mark.parametrize(
+    ("K_d", "reason"), [([12.0, 20.0], "no real composite variable"), ([-3.0, 5.0], "must be > 0")]
+)
+def test_gains_without_a_composite_variable_are_refused_and_replaced(K_d, reason):
+    found = lesson("06", plant=GAINS.format(K_p=[40.0, 40.0], K_d=K_d, lam=1.0))
+    assert (found["K_d"] ** 2 >= 4 * found["K_p"] * found["lambda_d"]).all()
+    with pytest.raises(ValueError, match=reason):
+        composite([40.0, 40.0], K_d, 1.0)
 
-    def silent(K_p, K_d, lambda_d):
-        return large(K_p, max(K_d, 2.1 * np.sqrt(K_p * lambda_d)), lambda_d)
 
-    exercises.check("06-composite", large)
-    for wrong, reason in ((small, "small root"), (scaled, "paper's scale"), (silent, "ValueError")):
-        with pytest.raises(AssertionError, match=reason):
-            exercises.check("06-composite", wrong)
+@pytest.mark.parametrize(
+    ("name", "answer", "reason"),
+    [
+        ("06-design", lambda s, f, g: (s + f, s * f, 0.01), "not the reverse"),
+        ("06-design", lambda s, f, g: (s * f, s + f, 1e-4), "can be longer"),
+        ("06-design", lambda s, f, g: (s * f, s + f, 2.0 / (s + f)), "too long"),
+        ("06-verdict", lambda K_p, K_d, g, dt: "settles", "yours 'settles'"),
+        (
+            "06-verdict",
+            lambda p, d, g, dt: (
+                "alternates" if (d + g * composite(p, d).K2) * dt > 1 else "settles"
+            ),
+            "the level alone does not tell",
+        ),
+        ("06-commands", lambda n: np.full((n, 2), 3.0), "look alike"),
+        ("06-commands", lambda n: np.full((n, 2), 4.0), "beyond 3"),
+        ("06-commands", lambda n: np.random.default_rng(0).uniform(-3, 3, (n, 2)), "of the random"),
+    ],
+)
+def test_wrong_answers_get_a_fitting_hint(name, answer, reason):
+    assert reason in repr(exercises.check(name, answer))
