@@ -11,18 +11,21 @@ files that you trust); to keep weights without pickle, store `model.policy.actor
 
 from __future__ import annotations
 
+import copy
+import gc
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import VectorEnv
+from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from cmc.policies import ConvexGradientNetwork, IndependentNetwork, ModularPolicy, PositiveNetwork
 
 try:
+    from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.policies import ActorCriticPolicy
     from stable_baselines3.common.vec_env import VecEnv
 except ImportError as error:
@@ -30,6 +33,11 @@ except ImportError as error:
 
 Array = NDArray[np.float64]
 ACTOR_HIDDEN, CRITIC_HIDDEN = (32, 32), (64, 64)
+
+
+_WHERE = "is for PPO, A2C and their like, which ask a policy for a Gaussian action and a value"
+# What other algorithms ask their policies for.
+_FOREIGN = {"critic", "critic_target", "actor_target", "q_net", "lstm_actor", "quantile_net"}
 
 
 class _ModularActorCritic(ActorCriticPolicy):
@@ -56,7 +64,7 @@ class _ModularActorCritic(ActorCriticPolicy):
         self,
         observation_space: spaces.Space[Any],
         action_space: spaces.Space[Any],
-        lr_schedule: Any,
+        lr_schedule: Any = None,
         *,
         network_kwargs: dict[str, Any] | None = None,
         layout: dict[str, slice] | None = None,
@@ -67,6 +75,8 @@ class _ModularActorCritic(ActorCriticPolicy):
         net_arch: Any = None,
         **kwargs: Any,
     ) -> None:
+        if lr_schedule is None or "n_critics" in kwargs:
+            raise TypeError(f"{type(self).__name__} {_WHERE}")
         if not isinstance(action_space, spaces.Box) or len(action_space.shape) != 1:
             raise ValueError(f"wanted actions in a Box of one axis; got {action_space}")
         n = action_space.shape[0]
@@ -75,9 +85,11 @@ class _ModularActorCritic(ActorCriticPolicy):
                 f"wanted observations of shape ({2 * n},), (z_i, integral of z_i) for each of "
                 f"{n} actions, or a layout; got {observation_space.shape}"
             )
-        sizes = {"pi": ACTOR_HIDDEN, "vf": CRITIC_HIDDEN}
-        if net_arch is not None:
-            sizes = net_arch if isinstance(net_arch, dict) else {"pi": net_arch, "vf": net_arch}
+        _check_layout(layout, observation_space.shape or (), n)
+        sizes: dict[str, Any] = {"pi": ACTOR_HIDDEN, "vf": CRITIC_HIDDEN}
+        if net_arch is not None:  # as in Stable-Baselines3, a key left out means no hidden layer
+            both = net_arch if isinstance(net_arch, dict) else {"pi": net_arch, "vf": net_arch}
+            sizes = {"pi": (), "vf": (), **both}
         self._hidden = tuple(sizes["pi"])
         self._network_kwargs = dict(network_kwargs or {})
         self._modular = {
@@ -99,6 +111,20 @@ class _ModularActorCritic(ActorCriticPolicy):
         """The mean as a policy of this package, with `slope_bounds` and `jacobian`."""
         assert isinstance(self.action_net, ModularPolicy)
         return self.action_net
+
+    def on_signals(self) -> Any:
+        """The mean as a function of the plain s: behind the algorithm's VecNormalize if it has one.
+
+        Raises:
+            ValueError: if VecNormalize also scales T_a or R on their way to the policy.
+        """
+        found = _normalisation(self)
+        return self.actor if found is None else Normalised(self.actor, found)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in _FOREIGN:
+            raise AttributeError(f"{type(self).__name__} {_WHERE}: it has no {name!r}")
+        return super().__getattr__(name)
 
     def jacobian(self, s: Tensor) -> Tensor:
         """Slopes of the network, before the sign rule: s (..., n, 2) to (..., n, 2)."""
@@ -127,6 +153,68 @@ class _ModularActorCritic(ActorCriticPolicy):
             "network_kwargs": self._network_kwargs,
             "net_arch": sizes,
         }
+
+
+def _check_layout(layout: dict[str, slice] | None, shape: tuple[int, ...], n: int) -> None:
+    """Refuse a layout whose parts have the wrong length in an observation of this shape."""
+    wanted = {"s": 2 * n, "R": n, "T_a": n * n}
+    for name, part in (layout or {}).items():
+        inside = range(*part.indices(shape[0])) if len(shape) == 1 else range(0)
+        if name in wanted and (len(inside) != wanted[name] or (part.stop or 0) > shape[0]):
+            raise ValueError(
+                f"layout: {name!r} needs {wanted[name]} numbers for {n} actions, got {part} of an "
+                f"observation of shape {shape}"
+            )
+
+
+def _normalisation(policy: nn.Module) -> Any:
+    """VecNormalize of the algorithm that holds a policy, if it scales observations; else None."""
+    holders = gc.get_referrers(policy)
+    holders += [owner for part in holders if isinstance(part, dict) for owner in _owners(part)]
+    for holder in holders:
+        if isinstance(holder, BaseAlgorithm):
+            found = holder.get_vec_normalize_env()
+            if found is not None and found.norm_obs:
+                return found
+    return None
+
+
+def _owners(attributes: dict[Any, Any]) -> list[Any]:
+    return [x for x in gc.get_referrers(attributes) if getattr(x, "__dict__", None) is attributes]
+
+
+class Normalised:
+    """A `ModularPolicy` behind VecNormalize: pi((s - mean) / std), s clipped, as it acts in a loop.
+
+    Its slopes are 1/std times as large, and vanish where VecNormalize clips.
+
+    Args:
+        policy: what sees the normalised signals.
+        scales: the VecNormalize, whose present mean and variance count.
+    """
+
+    def __init__(self, policy: ModularPolicy, scales: Any) -> None:
+        if set(policy.layout) != {"s"}:
+            raise ValueError("VecNormalize scales T_a and R as well: the policy sees wrong ones")
+        self.n, self.layout, self.normalise = policy.n, policy.layout, policy.normalise
+        self.integral, self.u0, self.R = policy.integral, policy.u0.numpy(), policy.R.numpy()
+        self.network = copy.deepcopy(policy.network).double()
+        part, shape = policy.layout["s"], (self.n, 2)
+        self.mean = scales.obs_rms.mean[part].reshape(shape)
+        self.std = np.sqrt(scales.obs_rms.var[part] + scales.epsilon).reshape(shape)
+        self.clip = float(scales.clip_obs)
+        self.bounds = policy.slope_bounds()
+
+    def pi(self, s: Array) -> Array:
+        """The network on the signals as it sees them, (..., n, 2) to (..., n)."""
+        seen = np.clip((s - self.mean) / self.std, -self.clip, self.clip)
+        seen = seen * [1.0, float(self.integral)]
+        like = next(self.network.parameters())
+        return np.asarray(self.network(like.new_tensor(seen)).detach().numpy())
+
+    def slope_bounds(self) -> tuple[Array, Array]:
+        """From 0, where it is clipped, to the network's over std, (n, 2) each."""
+        return 0.0 * self.bounds[0], self.bounds[1] / self.std
 
 
 class ContractingPolicy(_ModularActorCritic):
@@ -161,6 +249,12 @@ class BatchedVecEnv(VecEnv):
     """
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
+        if mode != AutoresetMode.SAME_STEP:
+            raise ValueError(
+                "wanted a vector environment that restarts in the same step (autoreset_mode="
+                f"AutoresetMode.SAME_STEP), as Stable-Baselines3 expects; got {mode}"
+            )
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._seed: int | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -9,9 +10,13 @@ from gymnasium import spaces
 
 pytest.importorskip("stable_baselines3")
 
+from stable_baselines3 import DDPG, SAC, TD3
 from stable_baselines3 import PPO as SB3PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from cmc import plants
+from cmc.envs.auxiliary_space import AuxiliarySpaceWrapper
 from cmc.envs.peg_touch import PegTouchEnv, PegTouchVectorEnv
 from cmc.learning.ppo import PPO, PPOConfig
 from cmc.policies import ModularPolicy, NegativeWeightError, PositiveNetwork
@@ -21,6 +26,11 @@ from cmc.sb3 import (
     ConvexGradientPolicy,
     IndependentPolicy,
 )
+from cmc.theory.action import action_of
+from cmc.theory.certify import certify
+from cmc.theory.exact import Region
+
+PEG = "cmc.envs:cmc/PegTouch-v0"
 
 UPDATES = 40
 CONFIG = PPOConfig(critic_hidden=(32, 32))
@@ -141,3 +151,79 @@ def test_spaces_that_do_not_fit():
         ContractingPolicy(seen, spaces.Discrete(3), schedule)
     policy = ContractingPolicy(seen, action, schedule, layout={"s": slice(1, 5)})
     assert policy.actor.n == 2
+
+
+def lags(scales=None, clip_obs=10.0):
+    """Two lags behind the wrapper, and behind VecNormalize with given standard deviations."""
+    A, B, h = np.diag([-2.0, -5.0]), np.diag([2.0, 10.0]), 0.1
+
+    class Lags(gymnasium.Env):
+        observation_space = spaces.Box(-50, 50, (2,), np.float64)
+        action_space = spaces.Box(-20, 20, (2,), np.float64)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.y = np.array([0.05, -0.05])
+            return self.y.copy(), {}
+
+        def step(self, u):
+            phi = np.exp(np.diag(A) * h)
+            self.y = phi * self.y + (1 - phi) * np.diag(B) / -np.diag(A) * u
+            return self.y.copy(), 0.0, False, False, {}
+
+    def wrapped():
+        return AuxiliarySpaceWrapper(Lags(), error=lambda y: y, model=lambda y: (A, B), h=h)
+
+    env = DummyVecEnv([wrapped])
+    if scales is not None:
+        env = VecNormalize(env, norm_reward=False, training=False, clip_obs=clip_obs)
+        env.obs_rms.mean[:], env.obs_rms.var[:] = 0.0, np.square(scales)
+    slopes = {"slope_min": [0.5, 0.5], "slope_max": [1.5, 1.0]}
+    kwargs = {"network_kwargs": slopes}
+    return SB3PPO(ContractingPolicy, env, policy_kwargs=kwargs, n_steps=64, seed=0, device="cpu")
+
+
+def test_a_certificate_sees_vec_normalize():
+    plant, h = plants.LinearPlant(np.diag([-2.0, -5.0]), np.diag([2.0, 10.0])), 0.1
+    plain = lags()
+    assert certify(plain.policy, plant, h=h)
+    scaled = lags([0.1, 0.01, 0.5, 0.05])
+    assert not certify(scaled.policy, plant, h=h)
+    box = Region([-0.02] * 2, [0.02] * 2, integral=0.02)
+    assert not certify(scaled.policy, plant, h=h, region=box)
+    unit = lags([1.0, 1.0, 1.0, 1.0])
+    assert not certify(unit.policy, plant, h=h)  # VecNormalize clips somewhere
+    assert certify(unit.policy, plant, h=h, region=box)
+
+
+def test_what_the_theory_sees_is_what_the_model_does():
+    model = lags([0.3, 0.1, 0.5, 0.2])
+    action = action_of(model.policy.on_signals(), 2)
+    s = np.random.default_rng(0).normal(size=(20, 2, 2))
+    seen = model.get_vec_normalize_env().normalize_obs(s.reshape(20, 4))
+    taken, _ = model.predict(seen.astype(np.float32), deterministic=True)
+    wanted = np.clip(action(s, np.ones(2)), -1, 1)
+    np.testing.assert_allclose(taken, wanted, atol=1e-5)
+
+
+def test_edges_of_other_algorithms_and_layouts():
+    peg = PegTouchEnv()
+    model = SB3PPO(ContractingPolicy, peg, policy_kwargs={"net_arch": {"pi": [16]}}, n_steps=64)
+    assert model.policy.net_arch["vf"] == []
+    kwargs = {"layout": {"s": slice(0, 9)}}
+    with pytest.raises(ValueError, match="layout: 's' needs 4 numbers"):
+        SB3PPO(ContractingPolicy, peg, policy_kwargs=kwargs, n_steps=64)
+    for algorithm in (SAC, TD3, DDPG):
+        with pytest.raises((AttributeError, TypeError), match="for PPO, A2C and their like"):
+            algorithm(ContractingPolicy, peg, buffer_size=10)
+    with pytest.raises(ValueError, match="restarts in the same step"):
+        BatchedVecEnv(gymnasium.make_vec(PEG, num_envs=2, vectorization_mode="sync"))
+
+
+def test_the_policy_that_ppo_holds_can_be_certified_in_a_box():
+    slopes = {"slope_min": 0.2, "slope_max": [0.6, 0.6]}
+    kwargs = {"network_kwargs": slopes}
+    model = SB3PPO(ContractingPolicy, PegTouchEnv(), policy_kwargs=kwargs, n_steps=64)
+    region = Region([1.0, -8.0], [3.0, -1.0])
+    answer = certify(model.policy, plants.get("peg"), region=region, y_ref=[2.0, -4.0])
+    assert not answer.refused, str(answer)

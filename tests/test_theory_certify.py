@@ -15,9 +15,10 @@ from cmc.theory.certificates import (
 from cmc.theory.certify import certify
 from cmc.theory.combinations import feedback
 from cmc.theory.contraction import contraction_rate, rate_from_cloud
-from cmc.theory.exact import Region, closed_loop, total_jacobian
+from cmc.theory.exact import Region
+from cmc.theory.jacobians import differences
 from cmc.theory.sampled import largest_slope
-from cmc.theory.simulate import rk4
+from cmc.theory.simulate import Loop, closed_loop
 
 
 @dataclass
@@ -56,7 +57,7 @@ def test_loop_jacobian_is_the_derivative_of_the_loop():
     slope = 1 / np.cosh((pol.room * np.stack([s[:, :3], s[:, 3:]], -1)).sum(-1)) ** 2
     p = -(pol.bypass[:, 0] + pol.room[:, 0] * slope)
     q = -(pol.bypass[:, 1] + pol.room[:, 1] * slope)
-    expected = total_jacobian(field, s)
+    expected = differences(field, s)
     np.testing.assert_allclose(loop_jacobian(Lambda, R, p, q), expected, atol=1e-8)
     with pytest.raises(ValueError, match="slopes"):
         loop_jacobian(Lambda, R, p[:, :2], q)
@@ -71,13 +72,13 @@ def test_linear_plants_get_exact_certificates_that_simulations_obey(name):
     # the metric is in (z, int z)
     f_y, f_u = plant.A, plant.B
     space = decompose(f_y, f_u)
-    field = closed_loop(pol, plant, lambda y: space)
     times, rng = np.linspace(0, 25, 1000), np.random.default_rng(6)
-    paths = rk4(lambda t, s: field(s), rng.normal(size=(12, 4)) * 3, times)
-    paths = np.concatenate([paths[..., :2] @ space.T_y.T, paths[..., 2:]], axis=-1)
+    start = rng.normal(size=(12, 4)) * 3
+    path = closed_loop(plant, pol, start[:, :2], times, transforms=space, integral=start[:, 2:])
+    paths = np.concatenate([path.z, path.integral], axis=-1)
     measured = rate_from_cloud(times, paths, answer.metric)
     assert measured.ratio.max() <= 1 + 1e-9
-    assert (measured.ratio <= np.exp(-answer.rate * times) + 1e-9).all()
+    assert (measured.ratio <= np.exp(-answer.rate * times) + 1e-7).all()
 
 
 def test_identity_transforms_are_not_certified_where_the_paper_needs_its_own():
@@ -128,11 +129,11 @@ def test_sampled_certificate_bounds_the_simulated_step():
     plant, pol, h = plants.get("coupled_lags"), policy(), 0.05
     answer = certify(pol, plant, h=h)
     space = decompose(plant.A, plant.B)
-    step = closed_loop(pol, plant, lambda y: space, h=h)
+    loop = Loop(plant, pol, space)
     s = np.random.default_rng(7).normal(size=(10, 4)) * 3
     path = [s]
     for _ in range(400):
-        path.append(step(path[-1]))
+        path.append(loop.step(path[-1], h))
     path = np.stack(path)
     path = np.concatenate([path[..., :2] @ space.T_y.T, path[..., 2:]], axis=-1)
     measured = rate_from_cloud(h * np.arange(401), path, answer.metric)
@@ -142,10 +143,11 @@ def test_sampled_certificate_bounds_the_simulated_step():
 def test_peg_is_certified_in_contact():
     peg = plants.get("peg")
     slow = policy((0.5, 2.0), (0.5, 4.0))
-    answer = certify(slow, peg)
-    assert answer
-    assert answer.kind == "frozen"
-    assert not certify(slow, peg, h=0.01)
+    box = Region([1.5, -2.5], [2.5, -0.5], integral=0.1)
+    answer = certify(slow, peg, region=box, y_ref=[2.0, -1.5])
+    assert answer, str(answer)
+    assert answer.kind == "exact"
+    assert not certify(slow, peg, region=box, h=0.01, y_ref=[2.0, -1.5])
 
 
 def test_torch_policies_are_understood():
@@ -173,8 +175,8 @@ def test_complex_pairs_are_certified_with_the_feedback_transform():
         pol = Policy(bypass, bypass * rng.uniform(0.1, 1.5, (2, 2)))
         answer = certify(pol, plant, transforms=space)
         held += answer.holds
-        field = closed_loop(pol, plant, lambda y: space)
-        J = total_jacobian(field, rng.normal(size=(300, 4)) * 3)
+        loop = Loop(plant, pol, space)
+        J = differences(lambda s, loop=loop: loop.field(0.0, s), rng.normal(size=(300, 4)) * 3)
         if answer:
             assert np.linalg.eigvals(J).real.max() < 0
             to_aux = np.block([[space.T_y, np.zeros((2, 2))], [np.zeros((2, 2)), np.eye(2)]])
@@ -247,8 +249,20 @@ def test_a_certificate_says_whether_it_is_a_proof_or_looked_at_points():
 
     policy = PositiveNetwork(2, slope_min=0.5, slope_max=2.0)
     proof = certify(policy, plants.get("coupled_lags"))
-    points = certify(policy, plants.get("pendulum"), kind="frozen")
+    box = Region([-0.3, -0.3], [0.3, 0.3], integral=0.3)
+    points = certify(policy, plants.get("pendulum"), region=box)
     assert proof.evidence == "proof"
     assert str(proof).startswith("contracting (exact")
     assert points.evidence == "points"
-    assert "grid points" in points.region
+    assert "at the points tried" in str(points)
+
+
+def test_frozen_answers_never_hold_where_the_transforms_move():
+    from cmc.policies import PositiveNetwork
+
+    policy = PositiveNetwork(2, slope_min=0.5, slope_max=2.0)
+    box = Region([-0.3, -0.3], [0.3, 0.3], integral=0.3)
+    answer = certify(policy, plants.get("pendulum"), kind="frozen", region=box)
+    assert not answer
+    assert "proves nothing" in answer.reason
+    assert answer.rate > 0

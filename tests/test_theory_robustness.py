@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -233,11 +235,16 @@ def test_unstable_loops_and_wrong_sizes_are_refused():
 def test_ball_of_a_certificate_takes_its_metric_and_its_rate():
     found = circle_criterion(2.0, 0.8, 2.4)
     ball = ErrorBall.of(found, PUSH)
+    assert ball.fits(1e9)
+    boxed = ErrorBall.of(replace(found, evidence="points", ball=2.0), PUSH)
+    edge = 2.0 / boxed.radius(1.0)
+    assert boxed.fits(0.99 * edge)
+    assert not boxed.fits(1.01 * edge)
     np.testing.assert_allclose(ball.metric, found.metric)
     assert ball.rate == found.rate > 0
     with pytest.raises(ValueError, match="without a certificate"):
         ErrorBall.of(circle_criterion(0.1, 0.8, 2.4))
     with pytest.raises(ValueError, match="frozen"):
-        ErrorBall.of(circle_criterion(2.0, 0.8, 2.4, kind="frozen"))
+        ErrorBall.of(replace(found, kind="frozen"))
     with pytest.raises(ValueError, match="does not go with"):
         ErrorBall.of(found, period=0.01)

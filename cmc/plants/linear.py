@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmc.plants.base import Array, Plant, finite_matrix, parameter
+from cmc.theory.jacobians import not_square
 
 
 class LinearPlant(Plant):
@@ -22,6 +23,8 @@ class LinearPlant(Plant):
     def __init__(self, A: ArrayLike, B: ArrayLike) -> None:
         self.A = finite_matrix("A", A)
         self.n = len(self.A)
+        if np.ndim(B) == 2 and len(B) == self.n != np.shape(B)[1]:  # type: ignore[arg-type]
+            raise ValueError(not_square(self.n, np.shape(B)[1]))
         self.B = finite_matrix("B", B, self.n)
         self.state_names = tuple(f"y{i + 1}" for i in range(self.n))
         self.units = ("1",) * self.n

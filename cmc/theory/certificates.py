@@ -7,6 +7,8 @@ In the coordinates (z, int z) the loop z' = Lambda z + R a, a = pi(z, int z) has
 without any derivative of P or Q: nothing is ignored. It is affine in the slopes, so one metric that
 works at the corners of their intervals works for every slope in between, constant or not. That is
 what the inequalities of theorem 2 (`eq_theorem2`) lack: they look at one frozen time after another.
+
+Rounding is part of the account: a rate is lowered by a bound on it before it is compared with 0.
 """
 
 from __future__ import annotations
@@ -16,43 +18,56 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from cmc.theory.contraction import contraction_factor, contraction_rate, metric_factor, overshoot
+from cmc.theory.arrays import Array, checked, number
+from cmc.theory.contraction import metric_factor, overshoot
 from cmc.theory.metric_search import MetricSearch, condition_metric, search_metric
 
-Array = NDArray[np.float64]
 Kind = Literal["frozen", "exact"]
 Domain = Literal["continuous", "sampled"]
 Evidence = Literal["proof", "points"]
 
 # Settling for this share of the largest provable rate keeps the metric well conditioned.
 _SHARE = 0.9
+# So many vertices are searched at once; more join where they turn out to be violated.
+_AT_ONCE, _MORE, _ROUNDS = 40, 12, 12
+_CHUNK = 1024
 
 
 @dataclass(frozen=True)
 class Certificate:
     """What is guaranteed about a loop, or why nothing is.
 
+    "proof": a quadratic metric common to all corners of the slopes' intervals, for a plant whose
+    Jacobians are constant, one action a signal, I_k = I_{k-1} + h z_k where sampled, and no command
+    that is clipped. "points": a metric that fits the total Jacobian at all points of a box that
+    were looked at, for trajectories that stay in the box. `ball` is a set that they do not leave.
+
     Attributes:
         holds: Whether contraction is shown, as far as `evidence` says.
-        kind: "exact" if the total Jacobian was used, "frozen" if the transforms were held constant,
-            which proves nothing about a loop whose transforms move with its state.
+        kind: "exact" if the total Jacobian was used, "frozen" if the transforms were held constant
+            where they move: that never holds, because it proves nothing.
         domain: "continuous", or "sampled" with a zero-order hold.
-        rate: Proved contraction rate, 1/s (NaN where nothing is proved).
-        metric: M of the distance that shrinks, (m, m), or None; in (z, int z), and in (y, int z)
-            where the total Jacobian over a box was used.
+        rate: Proved contraction rate, 1/s (NaN where nothing is proved; what each frozen instant
+            would have where `kind` is "frozen").
+        metric: M of the distance that shrinks, (m, m), or None; in (z, int z), or z alone where
+            the policy does not use int z, and with y in place of z where a box was looked at.
         violated: The Jacobian (or step) that stands in the way, (m, m), or None.
         region: Where it holds, in words.
         reason: Why it holds, or does not, in words.
         refused: Whether the question could not be asked at all.
         evidence: "proof" if the argument covers the whole region, "points" if the Jacobians were
             looked at on points of it and nothing is said about those between.
+        ball: Radius, in the metric, of the ball around the point of rest that no trajectory leaves:
+            inside it nothing leaves the box and no command reaches the plant's limits. NaN where
+            none was found; infinite for a plant without limits.
+        rest: That point of rest in the metric's coordinates, (m,), or None.
     """
 
     holds: bool
-    kind: Kind
+    kind: Kind = "exact"
     domain: Domain = "continuous"
     rate: float = float("nan")
     metric: Array | None = None
@@ -61,6 +76,8 @@ class Certificate:
     reason: str = ""
     refused: bool = False
     evidence: Evidence = "proof"
+    ball: float = float("nan")
+    rest: Array | None = None
 
     def __bool__(self) -> bool:
         return self.holds
@@ -104,9 +121,7 @@ def loop_jacobian(Lambda: ArrayLike, R: ArrayLike, p: ArrayLike, q: ArrayLike) -
     return J
 
 
-def circle_criterion(
-    c: float, k1: float, k2: float, *, kind: Kind = "exact", region: str = "everywhere"
-) -> Certificate:
+def circle_criterion(c: float, k1: float, k2: float, *, region: str = "everywhere") -> Certificate:
     """Decide w'' + c w' + k(t) w = 0 with c constant and k anywhere in [k1, k2], w = int z.
 
     A common quadratic metric exists if and only if 0 < k1 and sqrt(k2) - sqrt(k1) < c. It can be
@@ -117,39 +132,41 @@ def circle_criterion(
         c: Damping -(Lambda + R p), 1/s.
         k1: Smallest stiffness -R q, 1/s^2.
         k2: Largest stiffness, 1/s^2.
-        kind: What the certificate shall state about the transforms behind c and k.
         region: Where c and k hold, in words.
 
     Raises:
         ValueError: if k1 > k2 or a value is not finite.
     """
-    if not (np.isfinite([c, k1, k2]).all() and k1 <= k2):
+    c, k1, k2 = number("c", c), number("k1", k1), number("k2", k2)
+    if k1 > k2:
         raise ValueError(f"finite c and k1 <= k2 are needed, got c {c}, k1 {k1}, k2 {k2}")
     corners = np.array([[[-c, -k], [1.0, 0.0]] for k in (k1, k2)])
-    if not _circle(c, k1, k2):
-        first = k1 <= 0 or c <= 0
+    first = k1 <= 0 or c <= 0
+    if _circle(c, k1, k2):
+        low, high = 0.0, c / 2
+        for _ in range(60):
+            beta = (low + high) / 2
+            low, high = (beta, high) if _circle(*_shifted(c, k1, k2, beta)) else (low, beta)
+        beta = _SHARE * low
+        damping, soft, stiff = _shifted(c, k1, k2, beta)
+        mixed = damping**2 / 2 + np.sqrt(soft * stiff)
+        # (w' + beta w, w) are the coordinates of e^{beta t} w
+        shear = np.array([[1.0, beta], [0.0, 1.0]])
+        metric = shear.T @ np.array([[1, damping / 2], [damping / 2, mixed]]) @ shear
+        rate = rate_in(corners, metric)
+        if rate > 0:
+            return Certificate(
+                True, rate=rate, metric=metric, region=region, reason="circle criterion"
+            )
+    if first:
+        reason = f"damping {c:.4g} and stiffness from {k1:.4g} on need to be positive"
+    else:
+        gap, most = np.sqrt(k2) - np.sqrt(k1), (c + np.sqrt(k1)) ** 2
         reason = (
-            f"damping {c:.4g} and stiffness from {k1:.4g} on need to be positive"
-            if first
-            else f"sqrt(k2) - sqrt(k1) = {np.sqrt(k2) - np.sqrt(k1):.4g} is not below c = {c:.4g}"
+            f"sqrt(k2) - sqrt(k1) = {gap:.4g} is not below c = {c:.4g}: the stiffness may reach "
+            f"{most:.4g}, and reaches {k2:.4g}"
         )
-        return Certificate(
-            False, kind, violated=corners[0 if first else 1], region=region, reason=reason
-        )
-    low, high = 0.0, c / 2
-    for _ in range(60):
-        beta = (low + high) / 2
-        low, high = (beta, high) if _circle(*_shifted(c, k1, k2, beta)) else (low, beta)
-    beta = _SHARE * low
-    damping, soft, stiff = _shifted(c, k1, k2, beta)
-    metric = np.array([[1, damping / 2], [damping / 2, damping**2 / 2 + np.sqrt(soft * stiff)]])
-    # (w' + beta w, w) are the coordinates of e^{beta t} w
-    shear = np.array([[1.0, beta], [0.0, 1.0]])
-    metric = shear.T @ metric @ shear
-    rate = float(contraction_rate(corners, metric).min())
-    return Certificate(
-        True, kind, rate=rate, metric=metric, region=region, reason="circle criterion"
-    )
+    return Certificate(False, violated=corners[0 if first else 1], region=region, reason=reason)
 
 
 def _circle(c: float, k1: float, k2: float) -> bool:
@@ -165,67 +182,117 @@ def common_metric(
     vertices: ArrayLike,
     *,
     h: float | None = None,
-    kind: Kind = "exact",
-    region: str = "everywhere",
+    region: str = "the hull of the vertices",
+    slack: ArrayLike | None = None,
 ) -> Certificate:
     """Look for one metric in which every vertex, and so every matrix in their hull, contracts.
+
+    A few vertices are searched at once, and those that the metric fails join them.
 
     Args:
         vertices: Jacobians, (V, m, m), 1/s; with `h` the steps of a sampled loop.
         h: Sample time, s, where the vertices are steps.
-        kind: What the certificate shall state about the transforms behind the vertices.
         region: Where the vertices bound the loop, in words.
+        slack: How far off each entry of a vertex may be, (m, m).
 
     Raises:
         ValueError: if the vertices have a wrong shape or are not finite.
     """
-    vertices = np.asarray(vertices, dtype=float)
+    vertices = np.asarray(vertices)
+    if vertices.ndim != 3 or not len(vertices):
+        raise ValueError(f"vertices needs shape (V, m, m) with V >= 1, got {vertices.shape}")
+    vertices = checked("vertices", vertices, "V m m")
+    h = None if h is None else number("h", h, above=0.0)
     domain: Domain = "continuous" if h is None else "sampled"
+    count = len(vertices)
+    active = np.unique(np.linspace(0, count - 1, min(_AT_ONCE, count)).astype(int))
+    best: tuple[float, Array] | None = None
+    for _ in range(_ROUNDS):
+        metric, aim, worst = _of_few(vertices[active], h)
+        if metric is None:
+            break
+        rates = rates_in(vertices, metric, h, slack)
+        rate = float(rates.min())
+        if rate > 0 and (best is None or rate > best[0]):
+            best = rate, metric
+        if rate >= 0.7 * aim or len(active) == count:
+            break
+        active = np.union1d(active, np.argsort(rates)[:_MORE])
+    if best is not None:
+        return Certificate(
+            True,
+            domain=domain,
+            rate=best[0],
+            metric=best[1],
+            region=region,
+            reason=f"one metric for {count} vertices",
+        )
+    resists = vertices[active[worst] if metric is None else int(np.argmin(rates))]
+    reason = _why_not(resists, domain)
+    return Certificate(False, domain=domain, violated=resists, region=region, reason=reason)
+
+
+def _of_few(vertices: Array, h: float | None) -> tuple[Array | None, float, int]:
+    """A well conditioned metric near the largest rate, that rate, and the vertex that resists."""
     found = _search(vertices, 0.0, h)
     if found.metric is None:
-        worst = vertices[found.worst]
-        return Certificate(
-            False,
-            kind,
-            domain,
-            violated=worst,
-            region=region,
-            reason=_why_not(worst, domain),
-        )
-    high = float(-np.linalg.eigvals(vertices).real.max())
+        return None, float("nan"), found.worst
+    eigenvalues = np.linalg.eigvals(vertices)
+    high = float(-eigenvalues.real.max())
     if h is not None:
-        high = float(-np.log(np.abs(np.linalg.eigvals(vertices)).max()) / h)
-    low = 0.0
+        high = float(-np.log(max(np.abs(eigenvalues).max(), 1e-3)) / h)
+    metric, low = found.metric, max(rate_in(vertices, found.metric, h), 0.0)
     for _ in range(8):
+        if high < 1.03 * low:
+            break
         middle = (low + high) / 2
-        low, high = (
-            (middle, high) if _search(vertices, middle, h).metric is not None else (low, middle)
-        )
-    metric = _search(vertices, (1 + _SHARE) / 2 * low, h).metric
-    metric = found.metric if metric is None else best_conditioned(vertices, metric, _SHARE * low, h)
-    return Certificate(
-        True,
-        kind,
-        domain,
-        rate=rate_in(vertices, metric, h),
-        metric=metric,
-        region=region,
-        reason=f"one metric for {len(vertices)} vertices",
-    )
+        ahead = _search(vertices, middle, h).metric
+        if ahead is None:
+            high = middle
+        else:
+            metric, low = ahead, max(middle, rate_in(vertices, ahead, h))
+    return best_conditioned(vertices, metric, _SHARE * low, h), _SHARE * low, found.worst
 
 
-def rate_in(vertices: ArrayLike, metric: ArrayLike, h: float | None = None) -> float:
+def rate_in(
+    vertices: ArrayLike,
+    metric: ArrayLike,
+    h: float | None = None,
+    slack: ArrayLike | None = None,
+) -> float:
     """Smallest rate of the vertices in a metric, 1/s; with `h` of the steps of a sampled loop."""
-    if h is None:
-        return float(contraction_rate(vertices, metric).min())
-    return float(-np.log(contraction_factor(vertices, metric).max()) / h)
+    return float(rates_in(np.asarray(vertices, dtype=float), metric, h, slack).min())
+
+
+def rates_in(
+    vertices: Array, metric: ArrayLike, h: float | None = None, slack: ArrayLike | None = None
+) -> Array:
+    """Rates of the vertices (V, m, m) in a metric, lowered by a bound on rounding, (V,), 1/s."""
+    theta = metric_factor(metric)
+    inverse = np.linalg.inv(theta)
+    rates = np.empty(len(vertices))
+    for start in range(0, len(vertices), _CHUNK):
+        J = vertices[start : start + _CHUNK]
+        loose = 4e-16 * J.shape[-1] * np.abs(J) + (0.0 if slack is None else np.asarray(slack))
+        doubt = np.linalg.norm(np.abs(theta) @ loose @ np.abs(inverse), axis=(-2, -1))
+        local = theta @ J @ inverse
+        if h is None:
+            growth = np.linalg.eigvalsh((local + np.swapaxes(local, -1, -2)) / 2)[:, -1] + doubt
+            rates[start : start + _CHUNK] = -growth
+        else:
+            factor = np.linalg.norm(local, 2, axis=(-2, -1)) + doubt
+            rates[start : start + _CHUNK] = -np.log(np.maximum(factor, 1e-300)) / h
+    return rates
 
 
 def best_conditioned(vertices: Array, metric: Array, rate: float, h: float | None = None) -> Array:
     """The metric of smallest condition number that proves `rate`, from one that does, (m, m)."""
-    if h is not None:
-        return condition_metric(vertices * np.exp(rate * h), metric, discrete=True)
-    return condition_metric(vertices + rate * np.eye(vertices.shape[-1]), metric)
+    try:
+        if h is not None:
+            return condition_metric(vertices * np.exp(rate * h), metric, discrete=True)
+        return condition_metric(vertices + rate * np.eye(vertices.shape[-1]), metric)
+    except (np.linalg.LinAlgError, ValueError):  # too ill conditioned to be improved
+        return metric
 
 
 def _search(vertices: Array, rate: float, h: float | None) -> MetricSearch:
@@ -267,7 +334,7 @@ def compose_hierarchical(
     Raises:
         ValueError: if a rate is not positive or a coupling points the wrong way.
     """
-    if min(rates) <= 0:
+    if not (np.isfinite(rates).all() and min(rates) > 0):
         raise ValueError(f"every block needs a positive rate, got {list(rates)}")
     if any(i >= j for i, j in couplings):
         raise ValueError("blocks may only be driven by later ones: couplings need i < j")

@@ -1,12 +1,18 @@
 """Hand a policy and a plant to the theory and be told what is guaranteed, where, and how strongly.
 
-Two roads, and every answer says which one was taken:
+Three roads, and every answer says which one was taken:
 
-* from the policy's slope bounds alone. The loop splits into one 2 x 2 problem per dimension (circle
-  criterion or corner matrices) that a hierarchical metric joins. It holds for every policy within
-  the bounds. It is exact where the plant's Jacobians are constant, and frozen elsewhere;
-* from the total Jacobian of the loop in (y, int z), the derivatives of T_y and T_a included, over a
-  box. It is exact for this one policy, at every point that was looked at.
+* everywhere, from the interval of the policy's slopes, where the plant's Jacobians are constant:
+  one small problem for each block of the transformed plant (one mode, or a complex pair), joined as
+  a hierarchy, and then one metric for all corners. It holds for every policy within the interval;
+* in a box, from the total Jacobian of the loop (`cmc.theory.exact`), where they are not, or where
+  the slopes have no floor;
+* frozen, on request: the transforms held where they move. It never holds: it proves nothing.
+
+Each asks first whether the question is the right one: as many commands as signals, Jacobians that
+belong to f, a policy with one action a signal that was told the plant's own sign of R, slopes that
+are within the bounds it states. Command limits are outside of all three; `Certificate.ball` says
+from where on they are never reached.
 """
 
 from __future__ import annotations
@@ -19,26 +25,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmc.theory.auxiliary import AuxiliarySpace, decompose
+from cmc.theory.action import factor_of, inner, slope_interval
+from cmc.theory.arrays import Array, number
+from cmc.theory.auxiliary import AuxiliarySpace
+from cmc.theory.ball import ball_everywhere
 from cmc.theory.certificates import (
     Certificate,
-    Domain,
-    Kind,
-    best_conditioned,
     circle_criterion,
     common_metric,
     compose_hierarchical,
-    loop_jacobian,
     rate_in,
 )
 from cmc.theory.exact import Region, certify_exact
-from cmc.theory.sampled import hold_lag
-
-Array = NDArray[np.float64]
-# Beyond this many corner matrices the hierarchical metric is taken as it is.
-_MOST_CORNERS = 600
+from cmc.theory.jacobians import jacobian_fault, require_square
+from cmc.theory.sampled import hold
+from cmc.theory.simulate import transforms_of
 
 Transforms = Callable[[Array], AuxiliarySpace]
+Index = NDArray[np.intp]
+# Corner matrices of the whole loop are listed up to this many modes, 4^8 = 65536 of them.
+_MOST_MODES = 8
+_EPS = 2.2e-16
 
 
 def certify(
@@ -47,21 +54,22 @@ def certify(
     *,
     region: Region | None = None,
     h: float | None = None,
-    kind: Kind | None = None,
+    kind: str | None = None,
     transforms: AuxiliarySpace | Transforms | None = None,
     y_ref: ArrayLike = 0.0,
 ) -> Certificate:
     """Say what is guaranteed about a policy on a plant.
 
     Args:
-        policy: Has `slope_bounds() -> (lower, upper)`, magnitudes of the slopes before the sign
-            rule, ([seeds,] n, 2). Exact certificates of plants with varying Jacobians evaluate it:
-            `pi(s)` on numpy arrays (..., n, 2), or a torch module `network`.
-        plant: Has `n`, `f`, `f_y`, `f_u`, `hold`, bounds `y_low`, `y_high`, and `constant`.
-        region: Box that is looked at, on its grid; the plant's own bounds by default.
+        policy: Signed slopes (n, 2), or anything with `slope_bounds() -> (lower, upper)`,
+            magnitudes before the sign rule, ([seeds,] n, 2); in a box any policy that
+            `cmc.theory.simulate.closed_loop` takes.
+        plant: Has `n`, `f`, `f_y`, `f_u`, `constant`, bounds `y_low`, `y_high`, and limits
+            `u_low`, `u_high`.
+        region: Box that is looked at where nothing is proved everywhere; the plant's own bounds by
+            default where its Jacobians vary.
         h: Sample time of a zero-order hold, s; continuous control without it.
-        kind: "exact", "frozen", or None for exact where the plant's Jacobians are constant and
-            frozen elsewhere.
+        kind: "exact" (the default) or "frozen".
         transforms: T_y and T_a in place of `decompose`, fixed or as a function of y (..., n).
         y_ref: Where the latent signal is to go, (n,); its deviation is what the policy sees.
 
@@ -70,210 +78,266 @@ def certify(
         vanish, a transform that jumps) is its `reason`; `refused` marks questions it cannot answer.
 
     Raises:
-        TypeError: if the policy has no `slope_bounds`.
+        TypeError: if the policy has no slopes and no region is given.
         ValueError: if shapes do not fit or `kind` is unknown.
     """
     if kind not in (None, "exact", "frozen"):
         raise ValueError(f"kind needs to be 'exact', 'frozen' or None, got {kind!r}")
-    lower, upper = _slopes(policy, plant.n)
-    region = Region(plant.y_low, plant.y_high) if region is None else region
-    spaces = _as_function(transforms, plant)
-    constant = plant.constant and not callable(transforms)
-    kind = kind or ("exact" if constant else "frozen")
-    domain: Domain = "continuous" if h is None else "sampled"
-    points = region.grid()
-    looked = "everywhere" if constant else f"{region}, at {points[..., 0].size} grid points"
-    if constant:
-        points = points[(0,) * plant.n][None]
+    require_square(plant)
     try:
-        space = spaces(points)
+        policy = inner(policy)
+    except ValueError as error:
+        return Certificate(False, reason=str(error), refused=True)
+    h = None if h is None else number("h", h, above=0.0)
+    box = Region(plant.y_low, plant.y_high) if region is None else region
+    box.check(plant.n)
+
+    def refuse(reason: object) -> Certificate:
+        return Certificate(
+            False, domain="continuous" if h is None else "sampled", reason=str(reason), refused=True
+        )
+
+    if fault := jacobian_fault(plant, *box.corners):
+        return refuse(fault)
+    try:
+        spaces = transforms_of(plant, transforms, np.mean(box.corners, axis=0))
+        centre = spaces(np.mean(box.corners, axis=0))
     except (ValueError, np.linalg.LinAlgError) as error:
-        return Certificate(False, kind, domain, region=looked, reason=str(error), refused=True)
-    if kind == "exact" and not constant:
-        return certify_exact(policy, plant, spaces, region, h=h, y_ref=y_ref)
-    if getattr(policy, "normalise", False):
-        # the policy divides by R_ii: its slopes are loop gains already
-        R = space.R / np.abs(space.gains)[..., None, :]
-        space = replace(space, R=R)
-    if _triangular(space):
-        answer = _by_dimension(space, lower, upper, h, kind)
-    else:
-        answer = _all_at_once(space, lower, upper, h, kind)
-    return replace(answer, region=looked, evidence="proof" if constant else "points")
+        return refuse(error)
+    if (centre.gains == 0).any():
+        return refuse("R has a zero on its diagonal: some action does not move its own signal")
+    if kind == "frozen" and (callable(transforms) or not plant.constant):
+        return _frozen(policy, spaces, box, h)
+    if callable(transforms) or not plant.constant:
+        return certify_exact(policy, plant, spaces, box, h=h, y_ref=y_ref)
+    try:
+        answer = _everywhere(policy, plant, centre, h, y_ref)
+    except TypeError:
+        if region is None:
+            raise
+        answer = refuse("nothing bounds the slopes of the policy")
+    except ValueError as error:
+        answer = refuse(error)
+    if answer.holds or region is None or "wrong way" in answer.reason:
+        return answer
+    inside = certify_exact(policy, plant, spaces, box, h=h, y_ref=y_ref)
+    return replace(inside, reason=f"{inside.reason}. Not everywhere: {answer.reason}")
 
 
-def _slopes(policy: Any, n: int) -> tuple[Array, Array]:
-    """Slope magnitudes (n, 2); with an axis of seeds the interval that covers all of them."""
-    if not hasattr(policy, "slope_bounds"):
-        raise TypeError(f"{type(policy).__name__} has no slope_bounds(): nothing bounds its slopes")
-    lower, upper = (np.asarray(bound, dtype=float) for bound in policy.slope_bounds())
-    lower, upper = lower.reshape(-1, n, 2).min(axis=0), upper.reshape(-1, n, 2).max(axis=0)
-    if not np.isfinite([lower, upper]).all() or (lower < 0).any() or (lower > upper).any():
-        raise ValueError(f"slope bounds need 0 <= lower <= upper, got {lower} and {upper}")
-    return lower, upper
-
-
-def _as_function(transforms: AuxiliarySpace | Transforms | None, plant: Any) -> Transforms:
-    if callable(transforms):
-        return transforms
-    fixed = transforms
-
-    def spaces(y: Array) -> AuxiliarySpace:
-        u = plant.hold(y)
-        f_y, f_u = plant.f_y(y, u), plant.f_u(y, u)
-        if fixed is None:
-            return decompose(f_y, f_u)
-        return AuxiliarySpace.from_transforms(fixed.T_y, fixed.T_a, f_y, f_u)
-
-    return spaces
-
-
-def _triangular(space: AuxiliarySpace) -> bool:
-    """Whether Lambda is diagonal and R upper triangular, to rounding."""
-    off = space.Lambda - space.Lambda * np.eye(space.n)
-    below = np.tril(space.R, -1)
-    scale_L, scale_R = np.abs(space.Lambda).max(), np.abs(space.R).max()
-    return bool(np.abs(off).max() <= 1e-9 * scale_L and np.abs(below).max() <= 1e-9 * scale_R)
-
-
-def _hull(values: Array) -> Array:
-    """Smallest and largest value over all points, (2,), or (1,) where they agree."""
-    low, high = float(values.min()), float(values.max())
-    return np.array([low, high] if high - low > 1e-12 * max(abs(low), abs(high)) else [high])
-
-
-def _corners(*axes: Array) -> list[Array]:
-    """All combinations of the ends of several intervals, one array per interval."""
-    return [np.array(column) for column in zip(*product(*axes), strict=True)]
-
-
-def _by_dimension(
-    space: AuxiliarySpace, lower: Array, upper: Array, h: float | None, kind: Kind
+def _everywhere(
+    policy: Any, plant: Any, space: AuxiliarySpace, h: float | None, y_ref: ArrayLike
 ) -> Certificate:
-    """One 2 x 2 problem per dimension, joined by a hierarchical metric."""
-    n, blocks = space.n, []
-    domain: Domain = "continuous" if h is None else "sampled"
-    for i in range(n):
-        weak = _floor_missing(space, lower[i], i)
-        block = weak or _one_dimension(
-            space.eigenvalues[..., i], np.abs(space.gains[..., i]), lower[i], upper[i], h, kind
-        )
-        if not (isinstance(block, Certificate) and block.holds):
-            reason = block if isinstance(block, str) else block.reason
-            violated = None if isinstance(block, str) else block.violated
-            reason = f"Dimension {i + 1}: {reason}"
-            return Certificate(False, kind, domain, violated=violated, reason=reason)
-        blocks.append(block)
-    couplings = {
-        (i, j): _coupling(space, i, j, lower[j], upper[j], h)
-        for i in range(n)
-        for j in range(i + 1, n)
-    }
-    metrics = [block.metric for block in blocks if block.metric is not None]
-    metric, rate = compose_hierarchical(metrics, [b.rate for b in blocks], couplings, h=h)
-    # blocks are ordered (z_1, I_1, z_2, I_2, ...), certificates (z_1, ..., z_n, I_1, ..., I_n)
-    order = np.arange(2 * n).reshape(n, 2).T.ravel()
-    metric = metric[np.ix_(order, order)]
-    vertices = _all_corners(space, lower, upper, h)
-    if vertices is not None:
-        # the hierarchy proves contraction; among all metrics that do, take a well conditioned one
-        metric = best_conditioned(vertices, metric, 0.9 * rate, h)
-        rate = rate_in(vertices, metric, h)
-    reason = "every dimension contracts, joined as a hierarchy"
-    return Certificate(True, kind, domain, rate=rate, metric=metric, reason=reason)
+    """All policies within the interval of the slopes, on a plant with constant Jacobians."""
+    domain = "continuous" if h is None else "sampled"
+
+    def no(reason: str, violated: Array | None = None) -> Certificate:
+        return Certificate(False, domain=domain, violated=violated, reason=reason)  # type: ignore[arg-type]
+
+    low, high = slope_interval(policy, space.gains)
+    if told := _wrong_sign(policy, space):
+        return no(told)
+    loop = _Loop(plant, space, low, high, h)
+    for i in range(space.n):
+        if high[i, 1] * low[i, 1] <= 0 and (low[i, 1] != 0 or high[i, 1] != 0):
+            return no(
+                f"Dimension {i + 1}: the slope in int z has no floor above 0 (tanh saturates), so "
+                "no rate holds; a linear bypass (slope_min > 0) repairs it, or a region"
+            )
+    metrics, rates = [], []
+    for block in loop.blocks:
+        part = loop.block(block)
+        if not part.holds:
+            names = " and ".join(str(i + 1) for i in block)
+            where = f"Dimension{'s' * (len(block) > 1)} {names}"
+            return no(f"{where}: {_hint(loop, block) or part.reason}", part.violated)
+        assert part.metric is not None
+        metrics.append(part.metric)
+        rates.append(part.rate)
+    metric, rate = compose_hierarchical(metrics, rates, loop.couplings(), h=h)
+    order = np.argsort(np.concatenate([loop.states(block) for block in loop.blocks]))
+    metric, reason = (
+        metric[np.ix_(order, order)],
+        "every dimension contracts, joined as a hierarchy",
+    )
+    if space.n > _MOST_MODES:
+        doubt = rate - rate_in(loop.matrix(low)[None], metric, h, loop.slack)
+        rate = min(rate, rate - doubt) if doubt > 0 else rate
+    else:
+        corners = loop.corners(range(space.n))
+        found = common_metric(corners, h=h, slack=loop.slack)
+        rate = rate_in(corners, metric, h, loop.slack)
+        if found.holds and found.metric is not None:
+            metric, rate = found.metric, found.rate
+            reason = f"one metric for {len(corners)} corners of the slopes"
+    if not rate > 0:
+        return no("every dimension contracts, but rounding hides whether they do together")
+    answer = Certificate(True, domain=domain, rate=rate, metric=metric, reason=reason)  # type: ignore[arg-type]
+    return ball_everywhere(answer, policy, plant, space, (low, high), loop.keep, h, y_ref)
 
 
-def _all_corners(
-    space: AuxiliarySpace, lower: Array, upper: Array, h: float | None
-) -> Array | None:
-    """Corner matrices of the whole loop, (V, 2n, 2n); None where they are too many."""
-    n, drift, drive = space.n, space.eigenvalues, space.R
-    if h is not None:
-        drift, drive = hold_lag(drift, np.ones_like(drift), h)[0], _held_drive(space, h)
-    upper_right = np.triu_indices(n)
-    drive = drive * np.sign(space.gains)[..., None, :]  # the sign rule, once for all
-    axes = [_hull(drift[..., i]) for i in range(n)]
-    axes += [_hull(drive[..., i, j]) for i, j in zip(*upper_right, strict=True)]
-    axes += [np.unique([a, b]) for a, b in zip(lower.ravel(), upper.ravel(), strict=True)]
-    if np.prod([len(axis) for axis in axes]) > _MOST_CORNERS:
-        return None
-    corners = np.array(list(product(*axes)))
-    count = len(corners)
-    L, R = np.zeros((count, n, n)), np.zeros((count, n, n))
-    L[:, range(n), range(n)] = corners[:, :n]
-    R[:, upper_right[0], upper_right[1]] = corners[:, n : n + len(upper_right[0])]
-    k1, k2 = np.moveaxis(corners[:, -2 * n :].reshape(count, n, 2), -1, 0)
-    if h is None:
-        return loop_jacobian(L, R, -k1, -k2)
-    step = loop_jacobian(L, R, -(k1 + h * k2), -k2)
-    step[:, n:, :n], step[:, n:, n:] = h * np.eye(n), np.eye(n)
-    return step
+def _wrong_sign(policy: Any, space: AuxiliarySpace) -> str:
+    """What a policy that was told another sign of R than the plant's should hear, or ""."""
+    if not hasattr(policy, "slope_bounds"):
+        return ""
+    wrong = np.flatnonzero(factor_of(policy, space.gains) * space.gains < 0)
+    if not len(wrong):
+        return ""
+    i = int(wrong[0])
+    return (
+        f"Dimension {i + 1}: the policy pushes the wrong way: it was told another sign of R than "
+        f"the plant's R = {space.gains[i]:.4g} (`ModularPolicy(R=...)`)"
+    )
 
 
-def _held_drive(space: AuxiliarySpace, h: float) -> Array:
-    """R as it acts over one hold: row i is driven through its own lag, (..., n, n)."""
-    Lambda = np.broadcast_to(space.eigenvalues[..., :, None], space.R.shape)
-    return hold_lag(Lambda, space.R, h)[1]
+class _Loop:
+    """The loop in (z, int z) as a function of its slopes, exactly, with its block structure."""
+
+    def __init__(
+        self, plant: Any, space: AuxiliarySpace, low: Array, high: Array, h: float | None
+    ) -> None:
+        n, zero = space.n, np.zeros(space.n)
+        f_y, f_u = plant.f_y(zero, zero), plant.f_u(zero, zero)
+        T, V = space.T_y, np.linalg.inv(space.T_y)
+        self.n, self.low, self.high, self.h = n, low, high, h
+        self.keep = np.concatenate([np.arange(n), n + np.flatnonzero((high != 0)[:, 1])])
+        # the transformed plant as it is, not as it should be, and how far rounding may be off
+        Lambda, R = T @ f_y @ V, T @ f_u @ space.T_a
+        off = np.abs(T @ V - np.eye(n))
+        d_L = 8 * n * _EPS * np.abs(T) @ np.abs(f_y) @ np.abs(V) + np.abs(Lambda) @ off
+        d_R = 8 * n * _EPS * np.abs(T) @ np.abs(f_u) @ np.abs(space.T_a)
+        Lambda = np.where(np.abs(Lambda) <= d_L, 0.0, Lambda)
+        R = np.where(np.abs(R) <= d_R, 0.0, R)
+        self.Lambda, self.R = Lambda, R
+        self.blocks = _blocks((Lambda != 0) | (R != 0))
+        if h is not None:
+            self.Lambda, self.R = hold(Lambda, R, h)
+            reach = np.abs(self.Lambda)
+            d_L = h * d_L + 40 * n * _EPS * np.maximum(reach, reach.max())
+            d_R = h * d_R + 40 * n * _EPS * np.abs(self.R).max(axis=0)
+            for block in self.blocks:  # an exponential keeps zeros, but for rounding
+                self.Lambda[np.ix_(range(block[-1] + 1, n), block)] = 0.0
+                self.R[np.ix_(range(block[-1] + 1, n), block)] = 0.0
+        size = np.abs(np.stack([low, high])).max(axis=0)
+        k1 = size[:, 0] + (0.0 if h is None else h * size[:, 1])
+        self.slack = np.zeros((2 * n, 2 * n))
+        self.slack[:n, :n], self.slack[:n, n:] = 2 * (d_L + d_R * k1), 2 * d_R * size[:, 1]
+        self.slack = self.slack[np.ix_(self.keep, self.keep)]
+
+    def matrix(self, slopes: Array) -> Array:
+        """Jacobian, or with h the step in (z_k, I_{k-1}), for signed slopes (..., n, 2)."""
+        n, h = self.n, self.h
+        p, q = slopes[..., None, :, 0], slopes[..., None, :, 1]
+        J = np.zeros((*slopes.shape[:-2], 2 * n, 2 * n))
+        J[..., :n, :n] = self.Lambda + self.R * (p if h is None else p + h * q)
+        J[..., :n, n:] = self.R * q
+        J[..., n:, :n] = np.eye(n) * (1.0 if h is None else h)
+        J[..., n:, n:] = np.eye(n) * (0.0 if h is None else 1.0)
+        return J[..., self.keep[:, None], self.keep]
+
+    def corners(self, modes: Any) -> Array:
+        """Matrices at all corners of the slopes of some modes, the others at their lower ends."""
+        modes = list(modes)
+        ends = [np.unique([self.low[i, m], self.high[i, m]]) for i in modes for m in (0, 1)]
+        picked = np.array(list(product(*ends))).reshape(-1, len(modes), 2)
+        slopes = np.broadcast_to(self.low, (len(picked), self.n, 2)).copy()
+        slopes[:, modes] = picked
+        return self.matrix(slopes)
+
+    def states(self, block: list[int]) -> Index:
+        """Where the block's z and int z stand in the state."""
+        return np.flatnonzero(np.isin(self.keep % self.n, block))
+
+    def block(self, block: list[int]) -> Certificate:
+        """Certificate of one block alone."""
+        at = self.states(block)
+        corners = self.corners(block)[:, at[:, None], at]
+        if len(at) == 1 and self.h is None:
+            rate = -float(corners.max())
+            return Certificate(
+                rate > 0,
+                rate=rate,
+                metric=np.eye(1),
+                violated=corners[np.argmax(corners)],
+                reason=f"z grows at {-rate:.4g} 1/s",
+            )
+        if len(at) == 2 and len(block) == 1 and self.h is None:
+            c, k = -corners[:, 0, 0], -corners[:, 0, 1]
+            if c.min() == c.max():
+                return circle_criterion(float(c[0]), float(k.min()), float(k.max()))
+        return common_metric(corners, h=self.h)
+
+    def couplings(self) -> dict[tuple[int, int], Array]:
+        """Corners of the parts through which later blocks drive earlier ones."""
+        found = {}
+        for j, later in enumerate(self.blocks):
+            corners = self.corners(later)
+            for i, earlier in enumerate(self.blocks[:j]):
+                rows, columns = self.states(earlier), self.states(later)
+                found[i, j] = corners[:, rows[:, None], columns]
+        return found
 
 
-def _floor_missing(space: AuxiliarySpace, lower: Array, i: int) -> str:
-    """What is wrong with the lower ends of the slopes, or an empty string."""
-    grow, gain = float(space.eigenvalues[..., i].max()), float(np.abs(space.gains[..., i]).min())
-    if lower[1] <= 0:
-        return (
-            "the slope in int z has no floor above 0 (tanh saturates), so no rate holds; "
-            "a linear bypass (slope_min > 0) repairs it"
-        )
-    if grow - gain * lower[0] >= 0:
-        return f"Lambda = {grow:.4g} 1/s demands a slope floor above {grow / gain:.4g} in z"
+def _blocks(linked: Array) -> list[list[int]]:
+    """The finest partition of the modes into neighbours that is block upper triangular."""
+    blocks, n = [[0]], len(linked)
+    for i in range(1, n):
+        if linked[i:, : blocks[-1][-1] + 1].any():
+            blocks[-1].append(i)
+        else:
+            blocks.append([i])
+    return blocks
+
+
+def _hint(loop: _Loop, block: list[int]) -> str:
+    """Which slope to lower or raise, for one dimension in continuous time; else ""."""
+    if loop.h is not None or len(block) > 1:
+        return ""
+    i = block[0]
+    R, Lambda = loop.R[i, i], loop.Lambda[i, i]
+    p, q = -R * np.stack([loop.low[i], loop.high[i]]).T  # loop gains, positive where they damp
+    if p.min() - Lambda <= 0 and q.min() >= 0:
+        return f"Lambda = {Lambda:.4g} 1/s demands a slope floor above {Lambda / abs(R):.4g} in z"
+    if q.min() > 0:
+        most = (p.min() - Lambda + np.sqrt(q.min())) ** 2 / abs(R)
+        if q.max() / abs(R) >= most:
+            return (
+                f"no quadratic metric fits all slopes: the cap of the slope in int z, "
+                f"{q.max() / abs(R):.4g}, would have to be below {most:.4g}, or the floor in z "
+                "higher"
+            )
     return ""
 
 
-def _one_dimension(
-    Lambda: Array, gain: Array, lower: Array, upper: Array, h: float | None, kind: Kind
-) -> Certificate:
-    """Certificate of one dimension in (z_i, int z_i) for slopes in a box."""
-    slopes = [np.unique([lower[j], upper[j]]) for j in (0, 1)]
-    if h is not None:
-        phi, G = hold_lag(Lambda, gain, h)
-        # affine in each of phi, G, k1, k2 alone: the corners span the rest
-        f, g, k1, k2 = _corners(_hull(phi), _hull(G), *slopes)
-        rows = np.stack([f - g * (k1 + h * k2), -g * k2], axis=-1)
-        below = np.broadcast_to([h, 1.0], rows.shape)
-        return common_metric(np.stack([rows, below], axis=-2), h=h, kind=kind)
-    L, g, k1, k2 = _corners(_hull(Lambda), _hull(gain), *slopes)
-    c, k = g * k1 - L, g * k2
-    if np.ptp(c) <= 1e-12 * np.abs(c).max():
-        return circle_criterion(float(c[0]), float(k.min()), float(k.max()), kind=kind)
-    # the interval of stiffness does not depend on the sign of the damping's corner
-    rows = np.stack([-c, -k], axis=-1)
-    below = np.broadcast_to([1.0, 0.0], rows.shape)
-    return common_metric(np.stack([rows, below], axis=-2), kind=kind)
-
-
-def _coupling(
-    space: AuxiliarySpace, i: int, j: int, lower: Array, upper: Array, h: float | None
-) -> Array:
-    """Corners of the block through which dimension j drives dimension i, (V, 2, 2)."""
-    drive = space.R[..., i, j]
-    if h is not None:
-        drive = hold_lag(space.eigenvalues[..., i], drive, h)[1]
-    r, k1, k2 = _corners(_hull(drive), *(np.unique([lower[m], upper[m]]) for m in (0, 1)))
-    top = np.stack([r * (k1 + (h or 0.0) * k2), r * k2], axis=-1)
-    return np.stack([top, np.zeros_like(top)], axis=-2)
-
-
-def _all_at_once(
-    space: AuxiliarySpace, lower: Array, upper: Array, h: float | None, kind: Kind
-) -> Certificate:
-    """One metric for all corners of the slopes, where the transforms leave no hierarchy."""
-    if h is not None:
-        reason = "sampled control needs a diagonal Lambda and an upper triangular R"
-        return Certificate(False, kind, "sampled", reason=reason, refused=True)
-    n = space.n
-    sign = -np.sign(space.gains).reshape(-1, 1, n)
-    Lambda, R = (m.reshape(-1, 1, n, n) for m in (space.Lambda, space.R))
-    ends = [np.unique(pair) for pair in np.stack([lower, upper], -1).reshape(2 * n, 2)]
-    slopes = np.array(list(product(*ends))).reshape(-1, n, 2)
-    J = loop_jacobian(Lambda, R, sign * slopes[..., 0], sign * slopes[..., 1])
-    return common_metric(J.reshape(-1, 2 * n, 2 * n), kind=kind)
+def _frozen(policy: Any, spaces: Transforms, box: Region, h: float | None) -> Certificate:
+    """What each instant would have: one metric for the corners at a few points, and no proof."""
+    points = box.grid(3)
+    domain = "continuous" if h is None else "sampled"
+    where = f"{box}, at {len(points)} points"
+    try:
+        space = spaces(points)
+        vertices = []
+        for k in range(len(points)):
+            Lambda, R = space.Lambda[k], space.R[k]
+            if h is not None:
+                Lambda, R = hold(Lambda, R, h)
+            low, high = slope_interval(policy, space.gains[k])
+            ends = [np.unique(pair) for pair in np.stack([low, high], -1).reshape(-1, 2)]
+            slopes = np.array(list(product(*ends))).reshape(-1, space.n, 2)
+            here = replace(space, T_y=space.T_y[k], T_a=space.T_a[k], Lambda=Lambda, R=R)
+            if h is None:
+                vertices.append(here.loop(slopes))
+                continue
+            slopes[..., 0] += h * slopes[..., 1]
+            step = here.loop(slopes)
+            step[:, space.n :] = np.hstack([h * np.eye(space.n), np.eye(space.n)])
+            vertices.append(step)
+        found = common_metric(np.concatenate(vertices), h=h)
+    except (ValueError, np.linalg.LinAlgError) as error:
+        return Certificate(False, "frozen", domain, region=where, reason=str(error), refused=True)  # type: ignore[arg-type]
+    reason = (
+        f"every instant by itself contracts (rate {found.rate:.3g} 1/s), which proves nothing "
+        "where the transforms move; kind='exact' does"
+        if found.holds
+        else found.reason
+    )
+    return replace(found, holds=False, kind="frozen", region=where, reason=reason)

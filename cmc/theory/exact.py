@@ -2,41 +2,49 @@
 
 With u = u0 + T_a(y) a, a = -sign(R) pi(z, I), z = T_y(y) (y - y_ref), I' = z, the Jacobian of the
 loop contains d(T_a)/dy a and d(T_y)/dy (y - y_ref), which the frozen analysis drops. They are taken
-here by central differences of the closed loop itself, so that nothing can be forgotten.
+here by central differences of the simulated loop itself, so that nothing can be forgotten.
+
+A metric that fits at all points of a box speaks of trajectories that stay in it. Which do is
+answered by the metric too: a ball around the point of rest that fits into the box is never left.
 """
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from cmc.theory.arrays import Array, checked
 from cmc.theory.auxiliary import AuxiliarySpace
-from cmc.theory.certificates import Certificate, Domain, common_metric
-from cmc.theory.contraction import contraction_factor, contraction_rate
+from cmc.theory.ball import ball_in_box
+from cmc.theory.certificates import Certificate, Domain, common_metric, rates_in
+from cmc.theory.jacobians import differences
+from cmc.theory.simulate import Loop
 
-Array = NDArray[np.float64]
-Field = Callable[[Array], Array]
+total_jacobian = differences
 
-_ROUNDS = 4
-_CHECKS = 3000
-_SUBSTEPS = 8
+Transforms = Callable[[Array], AuxiliarySpace]
+
+_ROUNDS = 5
+_GRID = 1024
+_CHECKS = 2048
 
 
 @dataclass(frozen=True)
 class Region:
-    """A box of latent signals, and of their integrals where the total Jacobian needs them.
+    """A box of latent signals and of their integrals.
 
     Attributes:
         y_low: Lower corner, (n,).
         y_high: Upper corner, (n,).
-        integral: Largest |int z| per dimension, (n,) or one number; only exact certificates of
-            plants with varying Jacobians use it.
-        points: Grid points per axis.
+        integral: Largest |int z| per dimension, (n,) or one number.
+        points: Grid points per axis of y, as long as there are not more than 1024.
+
+    Raises:
+        ValueError: if the corners are no box.
     """
 
     y_low: ArrayLike
@@ -45,115 +53,72 @@ class Region:
     points: int = 7
 
     def __post_init__(self) -> None:
-        low, high = np.asarray(self.y_low, dtype=float), np.asarray(self.y_high, dtype=float)
-        if low.ndim != 1 or low.shape != high.shape or not (low < high).all():
+        low = checked("y_low", self.y_low, "n")
+        high = checked("y_high", self.y_high, "n", n=len(low))
+        if not (low < high).all():
             raise ValueError(f"a region needs y_low < y_high, both (n,), got {low} and {high}")
-        if self.points < 2:
-            raise ValueError(f"a region needs at least 2 points per axis, got {self.points}")
+        reach = checked("integral", self.integral, above=0.0)
+        if reach.shape not in ((), low.shape):
+            raise ValueError(f"integral needs one number or ({len(low)},), got {reach.shape}")
+        if not 2 <= self.points <= 101:
+            raise ValueError(f"points needs 2 to 101 points per axis, got {self.points}")
 
-    def grid(self) -> Array:
-        """Grid of latent signals, (points, ..., points, n)."""
-        low, high = np.asarray(self.y_low, dtype=float), np.asarray(self.y_high, dtype=float)
-        axes = [np.linspace(a, b, self.points) for a, b in zip(low, high, strict=True)]
-        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    @property
+    def corners(self) -> tuple[Array, Array]:
+        """Lower and upper corner in y, (n,) each."""
+        return np.asarray(self.y_low, dtype=float), np.asarray(self.y_high, dtype=float)
+
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Lower and upper corner in (y, int z), (2n,) each."""
+        low, high = self.corners
+        reach = np.broadcast_to(np.asarray(self.integral, dtype=float), low.shape)
+        return np.concatenate([low, -reach]), np.concatenate([high, reach])
+
+    def check(self, n: int) -> None:
+        """Refuse another number of signals than `n`."""
+        if len(self.corners[0]) != n:
+            raise ValueError(f"region needs {n} signals, got {len(self.corners[0])}")
+
+    def grid(self, points: int | None = None) -> Array:
+        """Latent signals, (N, n): a grid where it has at most 1024 points, else spread evenly."""
+        return _spread(*self.corners, self.points if points is None else points)
 
     def __str__(self) -> str:
-        low, high = np.asarray(self.y_low, dtype=float), np.asarray(self.y_high, dtype=float)
-        box = " x ".join(f"[{a:.3g}, {b:.3g}]" for a, b in zip(low, high, strict=True))
+        box = " x ".join(f"[{a:.3g}, {b:.3g}]" for a, b in zip(*self.corners, strict=True))
         return f"y in {box}"
 
 
-def total_jacobian(field: Field, s: ArrayLike, step: float = 1e-5) -> Array:
-    """Jacobian of a vector field (or of a step) by central differences, (..., m, m).
-
-    Args:
-        field: Maps (..., m) to (..., m).
-        s: Points, (..., m).
-        step: Half width of the difference; its error is of order step^2.
-    """
-    s = np.asarray(s, dtype=float)
-    shift = step * np.eye(s.shape[-1])
-    up, down = field(s[..., None, :] + shift), field(s[..., None, :] - shift)
-    return np.swapaxes((up - down) / (2 * step), -1, -2)
+def _spread(low: Array, high: Array, points: int) -> Array:
+    """A grid of at most 1024 points; corners and random points where it would have more."""
+    m = len(low)
+    if points**m <= _GRID:
+        axes = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, m)
+    unit = np.random.default_rng(0).random((_GRID, m))
+    if m <= 8:
+        ends = np.stack(np.meshgrid(*[[0.0, 1.0]] * m, indexing="ij"), axis=-1).reshape(-1, m)
+        unit = np.concatenate([ends, unit, np.full((1, m), 0.5)])
+    return np.asarray(low + unit * (high - low))
 
 
 def closed_loop(
     policy: Any,
     plant: Any,
-    spaces: Callable[[Array], AuxiliarySpace],
+    spaces: Transforms,
     *,
     y_ref: ArrayLike = 0.0,
     h: float | None = None,
-) -> Field:
-    """Vector field of the loop in s = (y, int z), or with `h` its step from sample to sample.
-
-    Args:
-        policy: Has `pi(s)` on numpy arrays, or a torch module `network`; optionally `u0` and
-            `normalise`, as `cmc.policies.ModularPolicy` has.
-        plant: Has `n` and `f`.
-        spaces: Transforms as a function of y.
-        y_ref: Where the latent signal is to go, (n,).
-        h: Sample time, s.
-
-    Raises:
-        TypeError: if the policy cannot be evaluated.
-    """
-    pi, n, goal = _evaluator(policy), plant.n, np.asarray(y_ref, dtype=float)
-    u0 = np.asarray(getattr(policy, "u0", 0.0), dtype=float)
-    normalise = bool(getattr(policy, "normalise", False))
-
-    def signal(y: Array, space: AuxiliarySpace) -> Array:
-        return space.to_z(y - goal)
-
-    def command(z: Array, I: Array, space: AuxiliarySpace) -> Array:
-        size = 1 / np.abs(space.gains) if normalise else 1.0
-        # constraint_sign
-        return u0 + space.to_u(-np.sign(space.gains) * size * pi(np.stack([z, I], axis=-1)))
-
-    def field(s: Array) -> Array:
-        y, I = s[..., :n], s[..., n:]
-        space = spaces(y)
-        z = signal(y, space)
-        return np.concatenate([plant.f(y, command(z, I, space)), z], axis=-1)
-
-    def step(s: Array) -> Array:
-        assert h is not None
-        y, I = s[..., :n], s[..., n:]
-        space = spaces(y)
-        z = signal(y, space)
-        I = I + h * z
-        u, dt = command(z, I, space), h / _SUBSTEPS
-        for _ in range(_SUBSTEPS):
-            a = plant.f(y, u)
-            b = plant.f(y + dt / 2 * a, u)
-            c = plant.f(y + dt / 2 * b, u)
-            y = y + dt / 6 * (a + 2 * b + 2 * c + plant.f(y + dt * c, u))
-        return np.concatenate([y, I], axis=-1)
-
-    return field if h is None else step
-
-
-def _evaluator(policy: Any) -> Callable[[Array], Array]:
-    """The policy's networks as a function of numpy arrays, in double precision."""
-    if hasattr(policy, "pi"):
-        return policy.pi  # type: ignore[no-any-return]
-    network = getattr(policy, "network", policy)
-    if not (callable(network) and hasattr(network, "parameters")):
-        raise TypeError(f"{type(policy).__name__} has neither pi(s) nor a network to evaluate")
-    network = copy.deepcopy(network).double()
-    like = next(network.parameters())
-
-    def pi(s: Array) -> Array:
-        flat = network(like.new_tensor(s.reshape(-1, *s.shape[-2:])))
-        return flat.detach().numpy().reshape(s.shape[:-1])
-
-    return pi
+) -> Callable[[Array], Array]:
+    """Vector field of `cmc.theory.simulate.Loop` in (y, int z), or with `h` its step."""
+    loop = Loop(plant, policy, spaces, y_ref)
+    return (lambda s: loop.field(0.0, s)) if h is None else (lambda s: loop.step(s, h))
 
 
 def certify_exact(
     policy: Any,
     plant: Any,
-    spaces: Callable[[Array], AuxiliarySpace],
+    spaces: Transforms,
     region: Region,
     *,
     h: float | None = None,
@@ -161,102 +126,110 @@ def certify_exact(
 ) -> Certificate:
     """Exact certificate of one policy over a box of (y, int z).
 
-    One metric is sought for the total Jacobians on a grid, then tried at 3000 random points between
-    them; the worst of those join the vertices until none is left, a few rounds at most.
+    One metric is sought for the total Jacobians at 1024 points or so, then tried at 2048 others and
+    around the worst of all; what fails joins the vertices, a few rounds at most.
 
     Args:
-        policy: As in `closed_loop`.
-        plant: As in `closed_loop`.
+        policy: As in `cmc.theory.simulate.closed_loop`.
+        plant: As there.
         spaces: Transforms as a function of y.
-        region: Region with `grid()` and `integral`.
+        region: The box.
         h: Sample time, s; continuous without it.
         y_ref: Where the latent signal is to go, (n,).
 
     Returns:
-        A certificate whose metric is in (y, int z); refused where the policy cannot be evaluated
-        or a transform jumps.
+        A certificate whose metric is in (y, int z), or in y alone where the policy does not use
+        int z; refused where the policy cannot be evaluated or a transform jumps.
     """
     domain: Domain = "continuous" if h is None else "sampled"
     where = f"{region}, |int z| at most {np.asarray(region.integral).tolist()}"
 
-    def refuse(reason: str) -> Certificate:
-        return Certificate(False, "exact", domain, region=where, reason=reason, refused=True)
-
-    try:
-        field = closed_loop(policy, plant, spaces, y_ref=y_ref, h=h)
-    except TypeError as error:
-        return refuse(str(error))
-    if _jumps(spaces, region.grid()):
-        return refuse(
-            "T_y jumps inside the region (order or sign of its eigenvectors): track them along "
-            "the path, or shrink the region"
+    def refuse(reason: object) -> Certificate:
+        return Certificate(
+            False, "exact", domain, region=where, reason=str(reason), refused=True
         )
-    n, rng = plant.n, np.random.default_rng(0)
-    low, high = _bounds(region, n)
+
+    n, (low, high) = plant.n, region.limits
+    step, rng = 1e-6 * (high - low), np.random.default_rng(0)
     try:
-        vertices = total_jacobian(field, _coarse(low, high, region.points))
-        checks = total_jacobian(field, rng.uniform(low, high, (_CHECKS, 2 * n)))
-    except (ValueError, np.linalg.LinAlgError) as error:
-        return refuse(str(error))
-    return replace(_cutting_planes(vertices, checks, h), region=where)
-
-
-def _cutting_planes(vertices: Array, checks: Array, h: float | None) -> Certificate:
-    """Find a metric for the vertices, try it on the checks, add the worst, repeat."""
-    answer = common_metric(vertices, h=h)
-    for _ in range(_ROUNDS):
-        if answer.metric is None:
-            return answer
-        if h is None:
-            rates = contraction_rate(checks, answer.metric)
-        else:
-            rates = -np.log(contraction_factor(checks, answer.metric)) / h
-        if rates.min() > 0:
-            total = len(vertices) + len(checks)
-            return Certificate(
-                True,
-                "exact",
-                answer.domain,
-                rate=min(answer.rate, float(rates.min())),
-                metric=answer.metric,
-                reason=f"one metric at all {total} points of the box that were looked at, "
-                "while the trajectories stay in it",
-                evidence="points",
+        if _jumps(spaces, region):
+            return refuse(
+                "T_y jumps inside the region (order or sign of its eigenvectors): track them along "
+                "the path, or shrink the region"
             )
-        worst = np.argsort(rates)[:20]
-        vertices = np.concatenate([vertices, checks[worst]])
-        answer = common_metric(vertices, h=h)
-    return Certificate(
-        False,
-        "exact",
-        answer.domain,
-        violated=checks[int(np.argmin(rates))],
-        reason="metrics that fit the grid fail between its points",
+        loop = Loop(plant, policy, spaces, y_ref)
+        keep = slice(2 * n) if _integrates(loop, low, high) else slice(n)
+
+        def jacobians(s: Array) -> Array:
+            move = (lambda x: loop.field(0.0, x)) if h is None else (lambda x: loop.step(x, h))
+            J = differences(move, s, step)[:, keep, keep]
+            if not np.isfinite(J).all():
+                bad = s[np.flatnonzero(~np.isfinite(J).all(axis=(1, 2)))[0], :n]
+                raise ValueError(f"the loop is not finite at y = {bad}")
+            return J
+
+        points = _spread(low, high, min(region.points, int(_GRID ** (1 / (2 * n)))))
+        vertices, answer = jacobians(points), None
+        for _ in range(_ROUNDS):
+            answer = common_metric(vertices, h=h)
+            if answer.metric is None:
+                break
+            near = points[np.argsort(rates_in(vertices, answer.metric, h))[:64]]
+            around = near + rng.normal(size=(8, *near.shape)) * 0.05 * (high - low)
+            tried = np.concatenate(
+                [rng.uniform(low, high, (_CHECKS, 2 * n)), around.reshape(-1, 2 * n)]
+            )
+            tried = np.clip(tried, low, high)
+            checks = jacobians(tried)
+            rates = rates_in(checks, answer.metric, h)
+            if rates.min() > 0.3 * answer.rate:
+                break
+            worst = np.argsort(rates)[:20]
+            points = np.concatenate([points, tried[worst]])
+            vertices = np.concatenate([vertices, checks[worst]])
+    except (ValueError, TypeError, np.linalg.LinAlgError) as error:
+        return refuse(error)
+    if answer is None or answer.metric is None or rates.min() <= 0:
+        assert answer is not None
+        reason = (
+            answer.reason if answer.metric is None else "metrics that fit the grid fail between"
+        )
+        violated = answer.violated if answer.metric is None else checks[int(np.argmin(rates))]
+        return Certificate(
+            False,
+            "exact",
+            domain,
+            violated=violated,
+            region=where,
+            reason=reason,
+            evidence="points",
+        )
+    answer = replace(
+        answer,
+        kind="exact",
+        rate=min(answer.rate, float(rates.min())),
+        region=where,
+        reason=f"one metric at all {len(vertices) + len(checks)} points of the box that were "
+        "looked at, while the trajectories stay in it",
+        evidence="points",
     )
+    return ball_in_box(answer, loop, np.arange(2 * n)[keep], low, high, h)
 
 
-def _bounds(region: Region, n: int) -> tuple[Array, Array]:
-    """Corners of the box in (y, int z), (2n,) each."""
-    reach = np.broadcast_to(np.asarray(region.integral, dtype=float), (n,))
-    low = np.concatenate([np.asarray(region.y_low, dtype=float), -reach])
-    return low, np.concatenate([np.asarray(region.y_high, dtype=float), reach])
+def _integrates(loop: Loop, low: Array, high: Array) -> bool:
+    """Whether the command depends on int z at all."""
+    s = np.random.default_rng(1).uniform(low, high, (64, len(low)))
+    other = s.copy()
+    other[:, loop.n :] *= -0.37
+    return bool((loop.field(0.0, s) != loop.field(0.0, other)).any())
 
 
-def _coarse(low: Array, high: Array, points: int) -> Array:
-    """Grid over (y, int z): `points` per axis of y, three per integral, (N, 2n)."""
-    n = len(low) // 2
-    counts = [points] * n + [3] * n
-    axes = [np.linspace(a, b, k) for a, b, k in zip(low, high, counts, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2 * n)
-
-
-def _jumps(spaces: Callable[[Array], AuxiliarySpace], grid: Array) -> bool:
-    """Whether neighbouring points of the grid disagree about an eigenvector by more than 60 deg."""
-    V = np.linalg.inv(spaces(grid).T_y)
+def _jumps(spaces: Transforms, region: Region) -> bool:
+    """Whether points a hundredth of the box apart disagree about an eigenvector by over 60 deg."""
+    low, high = region.corners
+    a, b = np.random.default_rng(2).uniform(low, high, (2, 256, len(low)))
+    t = np.linspace(0, 1, 25)[:, None, None]
+    y = a + t * (b - a)
+    V = np.linalg.inv(np.broadcast_to(spaces(y).T_y, (*y.shape, y.shape[-1])))
     V = V / np.linalg.norm(V, axis=-2, keepdims=True)
-    for axis in range(grid.ndim - 1):
-        ahead = np.take(V, range(1, grid.shape[axis]), axis)
-        behind = np.take(V, range(grid.shape[axis] - 1), axis)
-        if ((ahead * behind).sum(axis=-2) < 0.5).any():
-            return True
-    return False
+    return bool(((V[1:] * V[:-1]).sum(axis=-2) < 0.5).any())

@@ -14,11 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
+from scipy.linalg import matrix_balance, solve_continuous_lyapunov, solve_discrete_lyapunov
 
 Array = NDArray[np.float64]
 
 _CONDITION = 1e6
+# A metric worse than this is left as it is: what could be gained is lost in rounding.
+_HOPELESS = 1e14
 _GAP = 1e-7
 
 
@@ -56,8 +58,11 @@ def search_metric(vertices: ArrayLike, *, discrete: bool = False) -> MetricSearc
     if growth[worst] >= 0 or _growth(J.mean(axis=0), discrete) >= 0:
         # a common metric would make every convex combination decay, the mean among them
         return MetricSearch(None, worst)
-    theta = _mean_metric_factor(J.mean(axis=0), discrete)
-    metric, worst = _feasible(_operators(theta @ J @ np.linalg.inv(theta), discrete))
+    try:
+        theta = _mean_metric_factor(J.mean(axis=0), discrete)
+        metric, worst = _feasible(_operators(theta @ J @ np.linalg.inv(theta), discrete))
+    except np.linalg.LinAlgError:  # further apart in size than floats can tell
+        return MetricSearch(None, worst)
     if metric is None:
         return MetricSearch(None, worst)
     return MetricSearch(_scaled(theta.T @ metric @ theta), worst)
@@ -78,6 +83,8 @@ def condition_metric(vertices: ArrayLike, metric: ArrayLike, *, discrete: bool =
         ValueError: if the given metric is not a common metric of the vertices.
     """
     J, start = np.asarray(vertices, dtype=float), _scaled(np.asarray(metric, dtype=float))
+    if np.linalg.cond(start) > _HOPELESS:
+        return start
     theta = np.linalg.cholesky(start).T
     operators = _operators(theta @ J @ np.linalg.inv(theta), discrete)
     m, d = start.shape[0], operators.shape[1]
@@ -100,7 +107,8 @@ def condition_metric(vertices: ArrayLike, metric: ArrayLike, *, discrete: bool =
 def _scaled(metric: Array) -> Array:
     """The symmetric part, with a smallest eigenvalue of 1."""
     metric = (metric + metric.T) / 2
-    return metric / np.linalg.eigvalsh(metric)[0]
+    smallest = np.linalg.eigvalsh(metric)[0]
+    return metric / (smallest if smallest > 0 else np.diag(metric).min())
 
 
 def _growth(J: Array, discrete: bool) -> Array:
@@ -110,11 +118,22 @@ def _growth(J: Array, discrete: bool) -> Array:
 
 
 def _mean_metric_factor(J: Array, discrete: bool) -> Array:
-    """Theta of a metric of the mean vertex: in those coordinates the search starts near."""
-    eye = np.eye(len(J))
-    solve = solve_discrete_lyapunov if discrete else solve_continuous_lyapunov
-    metric = solve(J.T, eye if discrete else -eye)
-    return np.linalg.cholesky((metric + metric.T) / 2).T
+    """Theta of a metric of the mean vertex: in those coordinates the search starts near.
+
+    The units of the coordinates are balanced first: by the matrix, then by the metric's diagonal.
+    """
+    eye, units = np.eye(len(J)), 1 / matrix_balance(J, permute=False, separate=True)[1][0]
+    size = 1.0 if discrete else float(np.abs(np.linalg.eigvals(J)).max())
+    for _ in range(3):
+        local = J * units[:, None] / units / size
+        solve = solve_discrete_lyapunov if discrete else solve_continuous_lyapunov
+        metric = solve(local.T, eye if discrete else -eye)
+        if not (np.diag(metric) > 0).all():
+            raise np.linalg.LinAlgError("the mean vertex has no metric in floats")
+        scale = np.sqrt(np.diag(metric))
+        units = units * scale
+    metric = (metric + metric.T) / 2 / scale / scale[:, None]
+    return np.linalg.cholesky(metric).T * units
 
 
 def _basis(m: int) -> Array:
@@ -171,7 +190,8 @@ def _center(
             break
         W = np.linalg.inv(C + np.einsum("kdij,d->kij", A, x))[:, None] @ A
         gradient = cost - np.einsum("kdii->d", W)
-        hessian = np.einsum("kaij,kbji->ab", W, W, optimize=True)
+        flat = W.transpose(1, 0, 2, 3).reshape(W.shape[1], -1)
+        hessian = flat @ W.transpose(1, 0, 3, 2).reshape(W.shape[1], -1).T
         scale = 1 / np.sqrt(np.diag(hessian))
         scaled = hessian * scale * scale[:, None]
         move = -scale * np.linalg.lstsq(scaled, scale * gradient, rcond=None)[0]

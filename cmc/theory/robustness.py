@@ -43,6 +43,8 @@ class ErrorBall:
     """B, (n, m): how the disturbance enters; the identity by default."""
     period: float | None = None
     """Control period in s of a sampled loop xi_{k+1} = Phi(xi_k) + B d_k; None means continuous."""
+    room: float = np.inf
+    """Largest distance in the metric at which it is known to hold: a certificate's `ball`."""
     theta: Array = field(init=False, repr=False)
     """Theta, (n, n), upper triangular, M = Theta^T Theta."""
 
@@ -70,6 +72,8 @@ class ErrorBall:
     ) -> ErrorBall:
         """Ball of a certified loop, while both trajectories stay in the certificate's region.
 
+        A certificate of a box holds in the box: `fits` says whether the ball around rest does.
+
         Args:
             certificate: one that holds and is exact: its metric and rate are used.
             channel: B, (n, m).
@@ -85,7 +89,8 @@ class ErrorBall:
         if (certificate.domain == "sampled") != (period is not None):
             raise ValueError(f"domain {certificate.domain!r} does not go with period {period!r}")
         pushed = None if channel is None else np.asarray(channel, float)
-        return cls(certificate.metric, certificate.rate, pushed, period)
+        room = np.inf if certificate.evidence == "proof" else np.nan_to_num(certificate.ball)
+        return cls(certificate.metric, certificate.rate, pushed, period, float(room))
 
     def distance(self, difference: ArrayLike) -> Array:
         """Length in the metric, ||Theta delta||, of differences (..., n)."""
@@ -118,6 +123,10 @@ class ErrorBall:
     def radius(self, size: float) -> float:
         """Radius of the ball in the metric, the limit of `bound`."""
         return float(self.bound(np.inf, 0.0, size))
+
+    def fits(self, size: float) -> bool:
+        """Whether the ball around rest stays where the certificate holds."""
+        return self.radius(size) <= self.room
 
     def output_bound(self, row: ArrayLike, time: ArrayLike, start: ArrayLike, size: float) -> Array:
         """Largest |row delta| at `time`: by Cauchy-Schwarz ||Theta^{-T} row|| times `bound`.

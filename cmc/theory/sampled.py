@@ -17,9 +17,10 @@ vary need a common metric (`certificates.common_metric` with `discrete=True`).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+from scipy.linalg import expm
 
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array, checked, number
 
 
 def _positive(name: str, value: ArrayLike) -> Array:
@@ -47,6 +48,26 @@ def hold_lag(Lambda: ArrayLike, R: ArrayLike, h: float) -> tuple[Array, Array]:
     flat = np.abs(Lambda * h) < 1e-12
     growth = np.expm1(Lambda * h) / np.where(flat, 1.0, Lambda)
     return np.exp(Lambda * h), R * np.where(flat, h, growth)
+
+
+def hold(Lambda: ArrayLike, R: ArrayLike, h: float) -> tuple[Array, Array]:
+    """Exact step of z' = Lambda z + R a under a held a, for full matrices: z + = Phi z + Gamma a.
+
+    Phi = e^{Lambda h} and Gamma = int_0^h e^{Lambda s} ds R, both blocks of one exponential.
+
+    Args:
+        Lambda: (n, n), 1/s.
+        R: (n, m).
+        h: Sample time, s.
+    """
+    Lambda = checked("Lambda", Lambda, "n n")
+    R = checked("R", R, "n m", n=len(Lambda))
+    h, (n, m) = number("h", h, above=0.0), R.shape
+    size = max(float(np.abs(R).max()), 1e-300)  # an exponential knows no units
+    block = np.zeros((n + m, n + m))
+    block[:n, :n], block[:n, n:] = Lambda * h, R / size
+    step = expm(block)
+    return step[:n, :n], step[:n, n:] * size * h
 
 
 def sampled_matrix(

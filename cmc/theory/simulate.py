@@ -8,7 +8,6 @@ sample. `cmc.theory.exact` differentiates the same loop, and so cannot speak of 
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -17,11 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
+from cmc.theory.action import action_of, inner
 from cmc.theory.arrays import Array, checked, number
 from cmc.theory.auxiliary import AuxiliarySpace, decompose
+from cmc.theory.tracking import aligned
 
 Transforms = Callable[[Array], AuxiliarySpace]
-Action = Callable[[Array, Array], Array]
 
 _MOST_STEPS = 100_000
 # Dormand and Prince 1980: y + h sum b_i k_i of order 5; _E is its difference to order 4.
@@ -197,59 +197,35 @@ def equilibrium(plant: Any, y: ArrayLike, t: float = 0.0) -> Array:
     return u
 
 
-def transforms_of(plant: Any, transforms: AuxiliarySpace | Transforms | None = None) -> Transforms:
-    """The auxiliary space as a function of y: given, fixed, or by `decompose` at equilibrium."""
+def transforms_of(
+    plant: Any,
+    transforms: AuxiliarySpace | Transforms | None = None,
+    centre: ArrayLike | None = None,
+) -> Transforms:
+    """The auxiliary space as a function of y: given, fixed, or by `decompose` at equilibrium.
+
+    Where Jacobians vary, eigenvectors keep the order and the signs that they have at `centre`, the
+    middle of the plant's box by default, so that no module changes its meaning on the way.
+    """
     if callable(transforms):
         return transforms
 
-    def at(y: Array, u: Array) -> AuxiliarySpace:
-        f_y, f_u = plant.f_y(y, u), plant.f_u(y, u)
-        if transforms is None:
-            return decompose(f_y, f_u)
-        return AuxiliarySpace.from_transforms(transforms.T_y, transforms.T_a, f_y, f_u)
+    def jacobians(y: Array) -> tuple[Array, Array]:
+        u = np.zeros(plant.n) if plant.constant else equilibrium(plant, y)
+        return plant.f_y(y, u), plant.f_u(y, u)
 
+    if transforms is not None:
+        T_y, T_a = transforms.T_y, transforms.T_a
+        at = np.zeros(plant.n)
+        space = AuxiliarySpace.from_transforms(T_y, T_a, *jacobians(at)) if plant.constant else None
+        return lambda y: space or AuxiliarySpace.from_transforms(T_y, T_a, *jacobians(y))
     if plant.constant:
-        space = at(np.zeros(plant.n), np.zeros(plant.n))
-        return lambda y: space
-    return lambda y: at(y, equilibrium(plant, y))
-
-
-def action_of(policy: Any, n: int) -> Action:
-    """A policy as a function from s = (z, int z), (..., n, 2), and diag(R), (..., n), to a.
-
-    Signed slopes (n, 2) and a function of s give a as they are. Everything else (an object with
-    `pi(s)`, a network, `ModularPolicy`, the policy of `cmc.sb3`) obeys a_i = -sign(R_ii) pi_i
-    (`constraint_sign`), with the R that it was told, if it was.
-
-    Raises:
-        TypeError: If it cannot be evaluated.
-    """
-    policy = getattr(policy, "actor", policy)
-    if not callable(policy) and not hasattr(policy, "pi"):
-        slopes = checked("policy", policy, "... n 2", n=n)
-        return lambda s, gains: (slopes * s).sum(axis=-1)
-    if hasattr(policy, "part"):
-        name = type(policy).__name__
-        raise TypeError(f"{name} sees a part of an observation, not (z, int z): pass a function")
-    if not hasattr(policy, "pi") and not hasattr(policy, "parameters"):
-        return lambda s, gains: np.asarray(policy(s), dtype=float)
-    pi = policy.pi if hasattr(policy, "pi") else _in_double(getattr(policy, "network", policy))
-    told = None if "R" in getattr(policy, "layout", {}) else getattr(policy, "R", None)
-    told = None if told is None else np.asarray(told, dtype=float)
-    seen = np.array([1.0, 1.0 if getattr(policy, "integral", True) else 0.0])
-    normalise = bool(getattr(policy, "normalise", False))
-
-    def action(s: Array, gains: Array) -> Array:
-        R = gains if told is None else told
-        return np.asarray(-(1 / R if normalise else np.sign(R)) * pi(s * seen))  # constraint_sign
-
-    return action
-
-
-def _in_double(network: Any) -> Callable[[Array], Array]:
-    network = copy.deepcopy(network).double()
-    like = next(network.parameters())
-    return lambda s: np.asarray(network(like.new_tensor(s)).detach().numpy())
+        found = decompose(*jacobians(np.zeros(plant.n)))
+        return lambda y: found
+    if centre is None:
+        centre = (np.asarray(plant.y_low) + np.asarray(plant.y_high)) / 2
+    first = decompose(*jacobians(np.asarray(centre, dtype=float)))
+    return lambda y: aligned(*jacobians(y), first)
 
 
 def closed_loop(
@@ -270,7 +246,7 @@ def closed_loop(
     Args:
         plant: Has `n`, `f`, `f_y`, `f_u`, `constant`.
         policy: Signed slopes (n, 2), a function from s (..., n, 2) to a, or any policy with
-            the sign rule: see `action_of`.
+            the sign rule: see `cmc.theory.action`.
         y0: Starts, (..., n); a network with seeds needs their axis in front.
         t: Increasing times, s, (time,).
         transforms: The auxiliary space, fixed or as a function of y; by default `decompose`, at
@@ -330,8 +306,9 @@ class Loop:
         clip: bool = False,
     ) -> None:
         self.plant, self.n, self.clip = plant, plant.n, clip
+        policy = inner(policy)
         self.action = action_of(policy, plant.n)
-        own = np.asarray(getattr(getattr(policy, "actor", policy), "u0", 0.0), dtype=float)
+        own = np.asarray(getattr(policy, "u0", 0.0), dtype=float)
         self.u0 = checked("u0", u0) + own
         self.spaces = transforms_of(plant, transforms)
         self.goal = y_ref if callable(y_ref) else None

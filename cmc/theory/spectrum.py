@@ -12,6 +12,8 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cmc.theory.jacobians import not_square
+
 Array = NDArray[np.float64]
 
 EPS = float(np.finfo(np.float64).eps)
@@ -59,7 +61,10 @@ def checked_pair(f_y: ArrayLike, f_u: ArrayLike) -> tuple[Array, Array]:
         TypeError: If the entries are not real numbers.
         ValueError: If shapes do not fit or an entry is not finite.
     """
-    f_y, f_u = checked_square(f_y, "f_y"), checked_square(f_u, "f_u")
+    f_y = checked_square(f_y, "f_y")
+    if np.ndim(f_u) >= 2 and np.shape(f_u)[-2] == f_y.shape[-1] != np.shape(f_u)[-1]:
+        raise ValueError(not_square(f_y.shape[-1], np.shape(f_u)[-1]))
+    f_u = checked_square(f_u, "f_u")
     if f_y.shape != f_u.shape:
         if f_y.shape[-1] != f_u.shape[-1]:
             raise ValueError(f"f_y and f_u must be of one size, got {f_y.shape} and {f_u.shape}")

@@ -120,6 +120,24 @@ def track(f_y_path: ArrayLike, f_u_path: ArrayLike) -> AuxiliarySpace:
     return assemble(eigenvalues, V, f_u)
 
 
+def aligned(f_y: ArrayLike, f_u: ArrayLike, like: AuxiliarySpace) -> AuxiliarySpace:
+    """Decompose with the order and signs that are nearest to those of one other space, (n, n).
+
+    Args:
+        f_y: Jacobians in `y` [1/s], (..., n, n).
+        f_u: Jacobians in `u`, (..., n, n).
+        like: The space to be near to, (n, n).
+    """
+    f_y, f_u = checked_pair(f_y, f_u)
+    eigenvalues, V = real_eigenbasis(f_y)
+    shares = _shares(inverse(like.T_y), V)
+    order = _step_orders(shares.reshape(-1, like.n, like.n)).reshape(eigenvalues.shape)
+    V = np.take_along_axis(V, order[..., None, :], axis=-1)
+    along = np.diagonal(_shares(inverse(like.T_y), V), axis1=-2, axis2=-1)
+    V = V * np.where(along < 0.0, -1.0, 1.0)[..., None, :]
+    return assemble(np.take_along_axis(eigenvalues, order, axis=-1), V, f_u)
+
+
 def _shares(before: Array, after: Array) -> Array:
     """Components of the new eigenvectors in the old basis, columns of unit norm.
 

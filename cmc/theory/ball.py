@@ -1,0 +1,144 @@
+"""The ball around the point of rest that no trajectory leaves, inside a box and off the limits.
+
+A metric in which a loop contracts shrinks the distance of every trajectory to the point of rest.
+So a ball around it stays, if the loop contracts in all of it: if it lies in the box that was looked
+at, and if no command is clipped in it. Under a hold that is said of the samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cmc.theory.arrays import Array
+from cmc.theory.auxiliary import AuxiliarySpace
+from cmc.theory.certificates import Certificate
+from cmc.theory.contraction import metric_factor
+from cmc.theory.jacobians import differences
+from cmc.theory.simulate import Loop
+
+_SAMPLES = 2048
+
+
+def rest_point(loop: Loop, keep: Array) -> Array | None:
+    """State (y, int z), (2n,), in which the loop rests; None where Newton's method finds none.
+
+    Args:
+        loop: Plant and policy.
+        keep: Which states the loop has, indices below 2n: an integral that nothing uses is free.
+    """
+    n = loop.n
+    start = np.concatenate([loop.y_ref + np.zeros(n), np.zeros(n)])
+
+    def residual(x: Array) -> Array:
+        s = np.broadcast_to(start, (*x.shape[:-1], 2 * n)).copy()
+        s[..., keep] = x
+        return loop.field(0.0, s)[..., keep]
+
+    x = start[keep]
+    r = residual(x)
+    first = scale = float(np.linalg.norm(r))
+    for _ in range(60):
+        if not np.isfinite(r).all():
+            return None
+        size = 1e-6 * (np.abs(x) + 1e-3 * np.abs(x).max() + 1e-6)
+        move = -np.linalg.lstsq(differences(residual, x, size), r, rcond=None)[0]
+        length = 1.0
+        while not np.linalg.norm(residual(x + length * move)) < scale and length > 1e-6:
+            length /= 2
+        if length <= 1e-6:
+            break
+        x = x + length * move
+        r = residual(x)
+        scale = float(np.linalg.norm(r))
+    if scale > 1e-9 * first + 1e-12:
+        return None
+    start[keep] = x
+    return start
+
+
+def ball_everywhere(
+    answer: Certificate,
+    policy: Any,
+    plant: Any,
+    space: AuxiliarySpace,
+    slopes: tuple[Array, Array],
+    keep: Array,
+    h: float | None,
+    y_ref: ArrayLike,
+) -> Certificate:
+    """Add the ball to a certificate in (z, int z) that holds for all commands within the limits.
+
+    |du_j| <= sum_i |T_a,ji| (|p_i| |dz_i| + |q_i| |dI_i|) over the interval of the slopes, and in a
+    ball of radius r each |dx_i| is at most r |row i of Theta^-1|.
+    """
+    low, high = _limits(plant)
+    if not (np.isfinite(low).any() or np.isfinite(high).any()):
+        return replace(answer, ball=np.inf)
+    try:
+        loop = Loop(plant, policy, space, y_ref)
+        rest = rest_point(loop, keep)
+    except (ValueError, TypeError, np.linalg.LinAlgError):
+        rest = None
+    caution = "while no command is clipped at the plant's limits"
+    if rest is None:
+        return replace(answer, reason=f"{answer.reason}; {caution}")
+    n, m = space.n, len(keep)
+    rows = np.zeros(2 * n)
+    rows[keep] = np.linalg.norm(np.linalg.inv(metric_factor(answer.metric)), axis=1)  # type: ignore[arg-type]
+    size = np.abs(np.stack(slopes)).max(axis=0)
+    p = size[:, 0] + (0.0 if h is None else h * size[:, 1])
+    speed = np.abs(space.T_a) @ (p * rows[:n] + size[:, 1] * rows[n:])
+    u = loop.signals(rest[:n], rest[n:])[1]
+    radius = float((np.minimum(u - low, high - u) / speed).min())
+    state = np.concatenate([space.to_z(rest[:n] - loop.y_ref), rest[n:]])[keep]
+    assert m == len(answer.metric)  # type: ignore[arg-type]
+    return _noted(replace(answer, rest=state), radius, caution)
+
+
+def ball_in_box(
+    answer: Certificate, loop: Loop, keep: Array, low: Array, high: Array, h: float | None
+) -> Certificate:
+    """Add the ball to a certificate in (y, int z) over a box; commands are looked at on points."""
+    caution = "nothing says that they do"
+    try:
+        rest = rest_point(loop, keep)
+    except (ValueError, np.linalg.LinAlgError):
+        rest = None
+    if rest is None:
+        return replace(answer, reason=f"{answer.reason} ({caution}: no point of rest was found)")
+    n, m = loop.n, len(keep)
+    spread = np.linalg.inv(metric_factor(answer.metric))  # type: ignore[arg-type]
+    room = np.minimum(rest - low, high - rest)[keep] / np.linalg.norm(spread, axis=1)
+    radius, limits, rng = float(room.min()), _limits(loop.plant), np.random.default_rng(3)
+    if radius > 0:
+        x = rng.normal(size=(_SAMPLES, m))
+        x *= rng.uniform(0, 1, (_SAMPLES, 1)) ** 0.2 / np.linalg.norm(x, axis=1, keepdims=True)
+        for _ in range(30):
+            s = np.broadcast_to(rest, (_SAMPLES, 2 * n)).copy()
+            s[:, keep] += radius * x @ spread.T
+            z, u = loop.signals(s[:, :n], s[:, n:])
+            if h is not None:
+                u = loop.signals(s[:, :n], s[:, n:] + h * z, z=z)[1]
+            if (u >= limits[0]).all() and (u <= limits[1]).all():
+                break
+            radius *= 0.8
+        else:
+            radius = 0.0
+    return _noted(replace(answer, rest=rest[keep]), 0.9 * radius, caution)
+
+
+def _noted(answer: Certificate, radius: float, caution: str) -> Certificate:
+    if not radius > 0:
+        why = "the point of rest lies outside of the box or of the command limits"
+        return replace(answer, reason=f"{answer.reason} ({caution}: {why})")
+    note = f"no trajectory leaves the ball of radius {radius:.3g} around rest in this metric"
+    return replace(answer, ball=radius, reason=f"{answer.reason}; {note}, nor is clipped in it")
+
+
+def _limits(plant: Any) -> tuple[Array, Array]:
+    low, high = getattr(plant, "u_low", -np.inf), getattr(plant, "u_high", np.inf)
+    return tuple(np.broadcast_to(np.asarray(x, dtype=float), (plant.n,)) for x in (low, high))  # type: ignore[return-value]
