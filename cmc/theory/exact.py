@@ -145,9 +145,7 @@ def certify_exact(
     where = f"{region}, |int z| at most {np.asarray(region.integral).tolist()}"
 
     def refuse(reason: object) -> Certificate:
-        return Certificate(
-            False, "exact", domain, region=where, reason=str(reason), refused=True
-        )
+        return Certificate(False, "exact", domain, region=where, reason=str(reason), refused=True)
 
     n, (low, high) = plant.n, region.limits
     step, rng = 1e-6 * (high - low), np.random.default_rng(0)
