@@ -10,6 +10,8 @@ from scipy.linalg import expm
 from cmc import plants
 from cmc.envs.auxiliary_space import AuxiliarySpaceWrapper
 from cmc.envs.peg_touch import PegTouchEnv
+from cmc.theory.auxiliary import ComplexEigenvalueError
+from cmc.theory.combinations import feedback
 
 H = 0.02
 
@@ -86,6 +88,37 @@ def test_the_peg_in_its_own_form_is_the_same_up_to_scale():
         )
         wanted, *_ = own.step(a)
         found, *_ = env.step(a)
+
+
+class Oscillator(Tanks):
+    """x'' = -4 x + u as y = (x, x'), a complex pair that `decompose` refuses; two commands."""
+
+    def __init__(self):
+        super().__init__()
+        self.f_y, self.f_u = np.array([[-0.1, 2.0], [-2.0, -0.1]]), np.eye(2)
+        block = np.block([[self.f_y, self.f_u], [np.zeros((2, 4))]])
+        self.step_matrix = expm(block * H)[:2]
+
+
+@pytest.mark.parametrize("as_function", [False, True])
+def test_a_lightly_damped_plant_works_through_transforms_of_ones_own(as_function):
+    env = Oscillator()
+    with pytest.raises(ComplexEigenvalueError):
+        AuxiliarySpaceWrapper(
+            env, error=lambda y: y, model=lambda y: (env.f_y, env.f_u), h=H
+        ).reset(seed=0)
+    space = feedback(env.f_y, env.f_u)
+    given = (lambda y: space) if as_function else space
+    wrapper = AuxiliarySpaceWrapper(env, error=lambda y: y, transforms=given, h=H, limit=20.0)
+    assert final_error(wrapper) < 1e-3
+    only = AuxiliarySpaceWrapper(env, error=lambda y: y, transforms=given, h=H, integral=False)
+    s, _ = only.reset(seed=0)
+    np.testing.assert_allclose(s, space.T_y @ env.y, atol=1e-6)
+    check_env(only, skip_render_check=True)
+    with pytest.raises(TypeError, match="either a model or transforms"):
+        AuxiliarySpaceWrapper(env, error=lambda y: y, h=H)
+    with pytest.raises(TypeError, match="AuxiliarySpace of 2, got 3"):
+        AuxiliarySpaceWrapper(env, error=lambda y: y, transforms=lambda y: 3, h=H).reset()
 
 
 def test_bad_input_is_refused():

@@ -1,5 +1,8 @@
 """Peg touch: exact integration, one convention in batch and single form, honest shifts."""
 
+import json
+from dataclasses import asdict
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -241,3 +244,21 @@ def test_bad_resets_are_refused():
         envs.reset(seed=[1, 2, 3])
     with pytest.raises(ValueError, match="reset_mask"):
         envs.reset(options={"reset_mask": np.ones(3)})
+
+
+@pytest.mark.parametrize("name", ["K_sur", "u0", "weight_x", "mount_angle", "h", "horizon"])
+@pytest.mark.parametrize("bad", [None, "31", float("nan"), [31.0, float("nan")], [31, 1, 2]])
+def test_a_configuration_takes_finite_numbers_only(name, bad):
+    with pytest.raises(ValueError, match=f"{name}: wanted"):
+        PegTouchConfig(**{name: bad})
+
+
+def test_a_configuration_read_back_from_json_is_the_same():
+    config = PegTouchConfig(K_sur=(2.0, 3.0))
+    fields = json.loads(json.dumps(asdict(config)))
+    shift = PegShift(**fields.pop("shift"))
+    assert PegTouchConfig(**fields, shift=shift) == config
+    with pytest.raises(ValueError, match="K_sur: wanted"):
+        PegTouchConfig(K_sur=[31, 1])
+    with pytest.raises(ValueError, match="shift: wanted a PegShift"):
+        PegTouchConfig(shift={})

@@ -23,3 +23,8 @@ register(
     entry_point="cmc.envs.peg_push:PegPushEnv",
     vector_entry_point="cmc.envs.peg_push:PegPushVectorEnv",
 )
+register(
+    id="cmc/Plant-v0",
+    entry_point="cmc.envs.plant_env:PlantEnv",
+    vector_entry_point="cmc.envs.plant_env:PlantVectorEnv",
+)

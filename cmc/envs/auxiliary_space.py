@@ -16,26 +16,31 @@ from cmc.theory.tracking import Tracker
 Array = NDArray[np.float64]
 Error = Callable[[Array], Array]
 Model = Callable[[Array], tuple[Array, Array]]
+Transforms = AuxiliarySpace | Callable[[Array], AuxiliarySpace]
 
 
 class AuxiliarySpaceWrapper(gym.Wrapper[NDArray[np.float32], Any, Any, Any]):
     """Observe (z_i, integral of z_i) and command u = u0 + T_a a, with z = T_y (y - y_d).
 
-    A policy that decreases in all of its inputs, one network per dimension, then meets the paper's
-    sign condition on any plant: R_ii is positive here (`constraint_sign`). Order, sign and scale of
-    the eigenvectors are followed from step to step, so that the integral keeps its meaning.
+    With `model`, a policy that decreases in all of its inputs, one network per dimension, meets the
+    paper's sign condition on any plant: R_ii is positive (`constraint_sign`). Order, sign and scale
+    of the eigenvectors are followed from step to step, so that the integral keeps its meaning.
+    With `transforms` of your own, R is theirs: tell it the policy.
 
     Args:
         env: an environment with Box observations and n commands.
         error: latent tracking error y - y_d (n,) of an observation.
         model: f_y and f_u, (n, n) each, at an observation.
+        transforms: in place of `model`: an `AuxiliarySpace`, or a function of the observation to
+            one, such as `feedback` or `schur` of `cmc.theory.combinations` give.
         h: time between two steps [s].
+        integral: whether the integral is observed; without it the observation is z (n,).
         u0: command to which T_a a is added, broadcast to (n,).
         limit: bound of the declared action space; the command is clipped to the env's own.
         bound: bound of the declared observation space; larger values are clipped to it.
 
     Raises:
-        TypeError: if the action space is no Box.
+        TypeError: if the action space is no Box, or not one of model and transforms is given.
         ValueError: if h is not positive, the action space is not flat, or (at a step) an action or
             an error has another shape or is not finite.
     """
@@ -45,8 +50,10 @@ class AuxiliarySpaceWrapper(gym.Wrapper[NDArray[np.float32], Any, Any, Any]):
         env: gym.Env[Any, Any],
         *,
         error: Error,
-        model: Model,
         h: float,
+        model: Model | None = None,
+        transforms: Transforms | None = None,
+        integral: bool = True,
         u0: ArrayLike = 0.0,
         limit: float = 1.0,
         bound: float = 1e6,
@@ -56,11 +63,15 @@ class AuxiliarySpaceWrapper(gym.Wrapper[NDArray[np.float32], Any, Any, Any]):
             raise TypeError(f"wanted a Box of commands, got {env.action_space}")
         if len(env.action_space.shape) != 1 or not (np.isfinite(h) and h > 0):
             raise ValueError(f"wanted flat commands and h > 0, got {env.action_space} and h = {h}")
-        self.n = env.action_space.shape[0]
-        self.error, self.model, self.h = error, model, float(h)
+        if (model is None) == (transforms is None):
+            raise TypeError("wanted either a model or transforms")
+        self.n, self.h = env.action_space.shape[0], float(h)
+        self.error, self.model, self.transforms = error, model, transforms
+        self._columns = slice(None, None, 1 if integral else 2)
+        size = 2 * self.n if integral else self.n
         self.u0 = np.broadcast_to(np.asarray(u0, dtype=float), (self.n,)).copy()
         self.action_space = spaces.Box(-limit, limit, (self.n,), np.float32)
-        self.observation_space = spaces.Box(-bound, bound, (2 * self.n,), np.float32)
+        self.observation_space = spaces.Box(-bound, bound, (size,), np.float32)
         self.integral: Array = np.zeros(self.n)
         self._tracker = Tracker()
         self.space: AuxiliarySpace | None = None
@@ -95,10 +106,16 @@ class AuxiliarySpaceWrapper(gym.Wrapper[NDArray[np.float32], Any, Any, Any]):
         e = np.asarray(self.error(seen), dtype=float)
         if e.shape != (self.n,) or not np.isfinite(e).all():
             raise ValueError(f"error: wanted {self.n} finite numbers, got {e}")
-        self.space = self._tracker.update(*self.model(seen))
+        if self.model is not None:
+            self.space = self._tracker.update(*self.model(seen))
+        else:
+            found = self.transforms(seen) if callable(self.transforms) else self.transforms
+            if not isinstance(found, AuxiliarySpace) or found.T_y.shape != (self.n, self.n):
+                raise TypeError(f"transforms: wanted an AuxiliarySpace of {self.n}, got {found!r}")
+            self.space = found
         z = self.space.T_y @ e
         self.integral = self.integral + self.h * z  # the new value included, as everywhere
-        s = np.stack([z, self.integral], axis=-1).ravel()
+        s = np.stack([z, self.integral], axis=-1).ravel()[self._columns]
         box = self.observation_space
         assert isinstance(box, spaces.Box)
         return np.clip(s, box.low, box.high).astype(np.float32)

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from cmc.envs.checks import set_numbers, whole
 from cmc.robot.osc import ControlLaw, Gains
 from cmc.robot.panda import JOINTS, Peg
 
@@ -62,17 +63,24 @@ class PandaTaskConfig:
     hold: bool = True
 
     def __post_init__(self) -> None:
-        for name, size in (("start", 3), ("start_box", 3), ("u_limit", self.low_size)):
-            if np.shape(getattr(self, name)) != (size,):
-                raise ValueError(f"{name} must hold {size} numbers, got {getattr(self, name)}")
-        for name in ("subgoal", "workspace"):
-            low, high = (np.array(getattr(self, f"{name}_{side}")) for side in ("low", "high"))
-            if low.shape != high.shape or not (low < high).all():
-                raise ValueError(f"{name}_low must lie below {name}_high, got {low} and {high}")
+        for name, kind in (("peg", Peg), ("gains", Gains), ("law", ControlLaw)):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name}: wanted a {kind.__name__}, got {getattr(self, name)!r}")
         if self.command not in ("pose", "joint"):
             raise ValueError(f"command must be 'pose' or 'joint', got {self.command!r}")
-        if self.ticks < 1 or self.horizon < 1:
-            raise ValueError(f"ticks and horizon must be positive: {self.ticks}, {self.horizon}")
+        sizes = {"start": 3, "start_box": 3, "u_limit": self.low_size}
+        names = ("start_joints", "tilt_limit", "joint_stiffness", "tick", "timestep")
+        for name in ("subgoal", "workspace"):
+            sizes |= dict.fromkeys(
+                (f"{name}_low", f"{name}_high"), np.size(getattr(self, f"{name}_low"))
+            )
+        set_numbers(self, sizes | dict.fromkeys(names, 0))
+        for name in ("subgoal", "workspace"):
+            low, high = (np.array(getattr(self, f"{name}_{side}")) for side in ("low", "high"))
+            if not (low < high).all():
+                raise ValueError(f"{name}_low must lie below {name}_high, got {low} and {high}")
+        for name in ("ticks", "horizon"):
+            object.__setattr__(self, name, whole(name, getattr(self, name)))
         steps = self.tick / self.timestep
         if abs(steps - round(steps)) > 1e-9 or steps < 1:
             raise ValueError(f"tick {self.tick} s is no multiple of timestep {self.timestep} s")

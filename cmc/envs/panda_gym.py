@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Literal, get_args
 
 import gymnasium as gym
+import mujoco
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
+from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
-from cmc.envs.panda_task import Array, Mask, PandaTask, checked
+from cmc.envs.checks import checked
+from cmc.envs.panda_task import Array, Mask, PandaTask
+from cmc.envs.vector import NativeVectorEnv, Seed, Step, without_pictures
 
 Observation = NDArray[np.float32]
 ActionMode = Literal["two_level", "low", "high"]
@@ -86,15 +88,19 @@ class ActionInterface:
 class PandaEnv(gym.Env[Observation, NDArray[np.float32]]):
     """One world of a peg task; the tasks' own classes document spaces and rewards."""
 
-    metadata: dict[str, Any] = {"render_modes": []}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
 
     def __init__(
         self,
         task: PandaTask,
         action_mode: ActionMode = "two_level",
         low_level: LowLevel | None = None,
+        render_mode: str | None = None,
     ) -> None:
-        self.task = task
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode: wanted None or 'rgb_array', got {render_mode!r}")
+        self.task, self.render_mode = task, render_mode
+        self._renderer: mujoco.Renderer | None = None
         self._interface = ActionInterface(task, action_mode, low_level)
         self.action_space = self._interface.space
         self.observation_space = observation_space(task)
@@ -116,6 +122,29 @@ class PandaEnv(gym.Env[Observation, NDArray[np.float32]]):
             flat[group] = {name: term.item() for name, term in info[group].items()}
         return obs[0].astype(np.float32), float(reward[0]), False, truncated.item(), flat
 
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The world from the scene's own point of view, (480, 640, 3); None without render mode.
+
+        Raises:
+            RuntimeError: where MuJoCo finds no graphics.
+        """
+        if self.render_mode is None:
+            gym.logger.warn("render was called without render_mode='rgb_array'")
+            return None
+        if self._renderer is None:
+            self._renderer = _renderer(self.task)
+        self._renderer.update_scene(self.task.worlds.data[0])
+        return np.asarray(self._renderer.render())
+
+    def close(self) -> None:
+        """Give the graphics back."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_renderer": None}  # graphics belong to a process
+
     def set_subgoal(self, high_action: ArrayLike) -> Observation:
         """Set the sub-goal and observe again; for the action mode "low"."""
         return self.task.set_subgoal(np.asarray(high_action)[None])[0].astype(np.float32)
@@ -129,52 +158,35 @@ class PandaEnv(gym.Env[Observation, NDArray[np.float32]]):
         return self.task.restore(snapshot)[0].astype(np.float32)
 
 
-class PandaVectorEnv(VectorEnv[Observation, ArrayLike, Any]):
+class PandaVectorEnv(NativeVectorEnv):
     """N worlds stepped in one call; world k with seed s + k is the single environment with it."""
-
-    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(
         self,
         task: PandaTask,
         action_mode: ActionMode = "two_level",
         low_level: LowLevel | None = None,
-        autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        render_mode: str | None = None,
     ) -> None:
-        if autoreset_mode not in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
-            raise ValueError(f"autoreset_mode: wanted SAME_STEP or DISABLED, got {autoreset_mode}")
-        self.task, self.num_envs = task, task.num
-        self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
-        self._same_step = autoreset_mode is AutoresetMode.SAME_STEP
-        self._interface = ActionInterface(task, action_mode, low_level)
-        self.single_action_space = self._interface.space
-        self.single_observation_space = observation_space(task)
-        self.action_space = batch_space(self.single_action_space, task.num)
-        self.observation_space = batch_space(self.single_observation_space, task.num)
+        without_pictures(render_mode)
+        self.task, self._interface = task, ActionInterface(task, action_mode, low_level)
+        seen = observation_space(task)
+        super().__init__(task.num, seen, self._interface.space, autoreset_mode)
 
-    def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Start new episodes everywhere, or where `options["reset_mask"]` says so."""
+    def _seed(self, seed: Seed) -> None:
         if seed is not None:
             self.task.seed(seed)
-        mask = (options or {}).get("reset_mask")
-        return self.task.reset(mask).astype(np.float32), {}
 
-    def step(self, actions: ArrayLike) -> tuple[Observation, Array, Mask, Mask, dict[str, Any]]:
-        """One step of every world; with SAME_STEP, ended episodes start anew at once."""
+    def _begin(self, mask: Mask, options: dict[str, Any]) -> Observation:
+        return self.task.reset(mask).astype(np.float32)
+
+    def _advance(self, actions: ArrayLike) -> Step:
         obs, reward, terminated, truncated, info = self._interface.step(actions)
-        if self._same_step and truncated.any():
-            last = np.empty(self.num_envs, dtype=object)
-            for k in np.flatnonzero(truncated):
-                last[k] = obs[k].astype(np.float32)
-            info = {**info, "final_obs": last, "_final_obs": truncated}
-            info |= {"final_info": {"success": info["success"]}, "_final_info": truncated}
-            obs = self.task.reset(truncated)
         return obs.astype(np.float32), reward, terminated, truncated, info
+
+    def _describe(self, info: dict[str, Any]) -> dict[str, Any]:
+        return {"success": info["success"]} if info else {}
 
     def set_subgoal(self, high_action: ArrayLike, mask: Mask | None = None) -> Observation:
         """Set the sub-goals of the masked worlds and observe again; for the action mode "low"."""
@@ -187,6 +199,16 @@ class PandaVectorEnv(VectorEnv[Observation, ArrayLike, Any]):
     def restore(self, snapshot: dict[str, Any]) -> Observation:
         """Go back to a snapshot; the observations there."""
         return self.task.restore(snapshot).astype(np.float32)
+
+
+def _renderer(task: PandaTask) -> mujoco.Renderer:
+    try:
+        return mujoco.Renderer(task.worlds.model, 480, 640)
+    except Exception as error:  # EGL, GLFW and OSMesa raise whatever they like
+        raise RuntimeError(
+            f"render_mode 'rgb_array' needs graphics (MUJOCO_GL: egl, glfw or osmesa): {error}; "
+            "cmc.view.playback.record makes a 3D page of a motion without any"
+        ) from error
 
 
 def observation_space(task: PandaTask) -> Any:

@@ -6,7 +6,6 @@ A tick lasts 20 ms. The low level acts at every tick; the high level sets a sub-
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -15,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cmc.envs.checks import checked
 from cmc.envs.panda_config import PandaTaskConfig
 from cmc.envs.panda_observation import FIXED, STATE, measure, observation_layout
 from cmc.envs.worlds import Worlds, pose_quat
@@ -268,18 +268,3 @@ class PandaTask:
 
 def _rebuild(kind: type[PandaTask], config: PandaTaskConfig, num: int, threads: int) -> PandaTask:
     return kind(config, num, threads=threads)
-
-
-def checked(value: ArrayLike, shape: tuple[int, ...], what: str) -> Array:
-    """`value` as a finite float array of the given shape.
-
-    Raises:
-        ValueError: on another shape, NaN or infinity.
-    """
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != shape:
-        raise ValueError(f"{what}: wanted shape {shape}, got {array.shape}")
-    flat = array.ravel()
-    if not math.isfinite(flat.dot(flat)) and not np.isfinite(array).all():  # the first is faster
-        raise ValueError(f"{what}: wanted finite numbers, got {array.tolist()}")
-    return array

@@ -14,10 +14,11 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
+from cmc.envs.checks import checked
 from cmc.envs.peg_touch_config import INTERFACES, PegShift, PegTouchConfig
+from cmc.envs.vector import NativeVectorEnv, SingleEnv, Step, without_pictures
 from cmc.plants import Peg
 
 __all__ = ["INTERFACES", "PegShift", "PegTouchConfig", "PegTouchEnv", "PegTouchVectorEnv"]
@@ -26,7 +27,7 @@ Array = NDArray[np.float64]
 SAMPLED = ("x0", "z0", "x_d", "f_d", "K_sur", "surface_sin", "surface_cos")
 
 
-class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
+class PegTouchVectorEnv(NativeVectorEnv):
     """Peg touch, natively batched.
 
     A peg moves horizontally (x) and vertically (z) behind two first-order lags,
@@ -97,7 +98,7 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
     |------------------|---------------------|------------|-------------------------------------|
     | `num_envs`       | int                 | 1          | trajectories                        |
     | `config`         | PegTouchConfig      | training   | every number of the task            |
-    | `autoreset_mode` | AutoresetMode       | SAME_STEP  | or DISABLED: states stay after the end |
+    | `autoreset_mode` | AutoresetMode, str  | SAME_STEP  | see `NativeVectorEnv`               |
     | `privileged`     | bool                | True       | whether info carries `privileged`   |
     | other keywords   | fields of config    |            | replace single fields               |
 
@@ -106,33 +107,22 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
     * v0: first version.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
     privileged_size = 10
 
     def __init__(
         self,
         num_envs: int = 1,
         config: PegTouchConfig | None = None,
-        autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         privileged: bool = True,
         **overrides: Any,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs: wanted at least 1, got {num_envs}")
-        if autoreset_mode not in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
-            raise ValueError(f"autoreset_mode: wanted SAME_STEP or DISABLED, got {autoreset_mode}")
-        overrides.pop("render_mode", None)
-        self.config = replace(config or PegTouchConfig(), **overrides)
-        self.num_envs = num_envs
-        self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
-        self._with_privileged = privileged
-        self._same_step = autoreset_mode is AutoresetMode.SAME_STEP
-        c = self.config
-        self.single_action_space = spaces.Box(-c.action_limit, c.action_limit, (2,), np.float32)
-        self.single_observation_space = spaces.Box(*_observation_bounds(c), dtype=np.float32)
-        self.action_space = batch_space(self.single_action_space, num_envs)
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._mount = _rotation(c.mount_angle)
+        without_pictures(overrides.pop("render_mode", None))
+        self.config = c = replace(config or PegTouchConfig(), **overrides)
+        action = spaces.Box(-c.action_limit, c.action_limit, (2,), np.float32)
+        observation = spaces.Box(*c.observation_bounds(), dtype=np.float32)
+        super().__init__(num_envs, observation, action, autoreset_mode)
+        self._with_privileged, self._mount = privileged, _rotation(c.mount_angle)
         self._generators: list[np.random.Generator] = []
         self.position: Array = np.zeros((num_envs, 2))
         """Position (x, z) [m], shape (num_envs, 2)."""
@@ -150,32 +140,14 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
         self.sampled: dict[str, Array] = {}
         """Values drawn at reset, name in `SAMPLED` to (num_envs,) array."""
 
-    def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start new trajectories, all of them or those of `options["reset_mask"]`."""
-        options = options or {}
-        self._seed(seed)
-        mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs)), dtype=bool)
-        if mask.shape != (self.num_envs,):
-            raise ValueError(f"reset_mask: wanted shape ({self.num_envs},), got {mask.shape}")
+    def _begin(self, mask: NDArray[np.bool_], options: dict[str, Any]) -> NDArray[np.float32]:
         self._restart(mask, options.get("parameters", {}))
-        return self._observe(), self._info()
+        return self._observe()
 
-    def step(
-        self, actions: ArrayLike
-    ) -> tuple[NDArray[np.float32], Array, NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Hold one command for a control period in every trajectory."""
+    def _advance(self, actions: ArrayLike) -> Step:
         if not self.sampled:
             raise gym.error.ResetNeeded("call reset before step")
-        a = np.asarray(actions, dtype=np.float64)
-        if a.shape != (self.num_envs, 2):
-            raise ValueError(f"actions: wanted shape ({self.num_envs}, 2), got {a.shape}")
-        if not np.isfinite(a).all():
-            raise ValueError("actions: wanted finite numbers, got NaN or infinity")
+        a = checked(actions, (self.num_envs, 2), "actions")
         c = self.config
         if c.stiffness_reference is not None:
             scale = c.stiffness_reference / self.sampled["K_sur"]
@@ -190,22 +162,13 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
         self._sense()
         self.integral = self.integral + c.h * self.signal
         self.steps += 1
-        error = np.abs(self.error)
-        terms = {
-            "position": -c.weight_x * error[:, 0],
-            "force": -c.weight_f * np.minimum(error[:, 1], c.force_error_cap),
-        }
+        e_x, e_f = np.abs(self.error).T
+        force = -c.weight_f * np.minimum(e_f, c.force_error_cap)
+        terms = {"position": -c.weight_x * e_x, "force": force}
         reward = terms["position"] + terms["force"]
         truncated = self.steps >= c.horizon
-        obs = self._observe()
-        info: dict[str, Any] = {"reward_terms": terms, **self._info()}
-        if self._same_step and truncated.any():
-            info |= {"final_obs": obs, "_final_obs": truncated}
-            info |= {"final_info": self._info(), "_final_info": truncated}
-            self._restart(truncated, {})
-            obs = self._observe()
-            info |= self._info()
-        return obs, reward, np.zeros(self.num_envs, dtype=bool), truncated, info
+        ended = np.zeros(self.num_envs, dtype=bool)
+        return self._observe(), reward, ended, truncated, {"reward_terms": terms}
 
     def transforms(self) -> tuple[Array, Array]:
         """T_y and T_a of the nominal in-contact model at the present x, (num_envs, 2, 2) each.
@@ -243,7 +206,7 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
                 )
             self._generators = [np.random.default_rng(s) for s in seed]
         elif seed is not None or not self._generators:
-            super().reset(seed=seed)
+            VectorEnv.reset(self, seed=seed)
             self._generators = [self.np_random]
 
     def _restart(self, mask: NDArray[np.bool_], fixed: Mapping[str, ArrayLike]) -> None:
@@ -300,7 +263,7 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
             columns = [signal[:, 0], integral[:, 0], signal[:, 1], integral[:, 1]]
         return np.stack(columns, axis=-1).astype(np.float32)
 
-    def _info(self) -> dict[str, NDArray[np.float32]]:
+    def _describe(self, info: dict[str, Any]) -> dict[str, NDArray[np.float32]]:
         """What a critic may know, if it is wanted."""
         if not self._with_privileged:
             return {}
@@ -320,57 +283,17 @@ class PegTouchVectorEnv(VectorEnv[NDArray[np.float32], ArrayLike, Any]):
         return {"privileged": np.stack(scaled, axis=-1).astype(np.float32)}
 
 
-class PegTouchEnv(gym.Env[NDArray[np.float32], NDArray[np.float32]]):
+class PegTouchEnv(SingleEnv):
     """Peg touch, one trajectory; everything else is documented at `PegTouchVectorEnv`."""
 
-    metadata: dict[str, Any] = {"render_modes": []}
-
     def __init__(
-        self,
-        config: PegTouchConfig | None = None,
-        render_mode: str | None = None,
-        **overrides: Any,
+        self, config: PegTouchConfig | None = None, render_mode: str | None = None, **overrides: Any
     ) -> None:
-        self.batch = PegTouchVectorEnv(1, config, AutoresetMode.DISABLED, **overrides)
+        without_pictures(render_mode)
+        super().__init__(PegTouchVectorEnv(1, config, AutoresetMode.DISABLED, **overrides))
         self.config = self.batch.config
-        self.render_mode = render_mode
-        self.action_space = self.batch.single_action_space
-        self.observation_space = self.batch.single_observation_space
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Start a new trajectory; see the class for `options`."""
-        super().reset(seed=seed)
-        stream = int(self.np_random.integers(2**31))
-        obs, info = self.batch.reset(seed=stream, options=options)
-        return obs[0], {"privileged": info["privileged"][0]}
-
-    def step(
-        self, action: ArrayLike
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """Hold one command for a control period."""
-        obs, reward, _, truncated, info = self.batch.step(np.asarray(action)[None])
-        terms = {name: float(term[0]) for name, term in info["reward_terms"].items()}
-        info = {"reward_terms": terms, "privileged": info["privileged"][0]}
-        return obs[0], float(reward[0]), False, bool(truncated[0]), info
 
 
 def _rotation(angle: float) -> Array:
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.array([[cosine, -sine], [sine, cosine]])
-
-
-def _observation_bounds(c: PegTouchConfig) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Largest values the limits and the horizon allow; generous, finite."""
-    stiffness, amplitude = c.K_sur[1], 2.0 * float(np.hypot(*np.abs(c.surface)))
-    force = stiffness * c.shift.K_sur * (max(map(abs, c.z_limits)) + c.shift.surface * amplitude)
-    if c.interface == "raw":
-        lowest = np.array([c.x_limits[0], -force, c.x_d[0], c.f_d[0]])
-        highest = np.array([c.x_limits[1], 0.0, c.x_d[1], c.f_d[1]])
-        return lowest.astype(np.float32), highest.astype(np.float32)
-    reach = max(c.x_limits[1], c.x_d[1], c.x0[1]) - min(c.x_limits[0], c.x_d[0], c.x0[0])
-    signal = np.array([reach, force + max(map(abs, c.f_d)) + stiffness * amplitude * reach])
-    time = (c.horizon + 1) * c.h
-    highest = 1.001 * np.stack([signal, time * signal], axis=-1).ravel()
-    return -highest.astype(np.float32), highest.astype(np.float32)

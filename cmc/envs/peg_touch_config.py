@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
+
+from cmc.envs.checks import set_numbers, whole
 
 INTERFACES = ("auxiliary", "identity", "raw")
 
@@ -23,8 +26,9 @@ class PegShift:
     """Factor on both surface coefficients [-]. Paper: 0.5 and 1.5."""
 
     def __post_init__(self) -> None:
+        set_numbers(self, dict.fromkeys(("tau_x", "tau_z", "K_sur", "surface"), 0))
         for name, value in vars(self).items():
-            if not (np.isfinite(value) and value > 0.0):
+            if value <= 0.0:
                 raise ValueError(f"shift {name}: wanted a positive factor, got {value}")
 
 
@@ -78,22 +82,41 @@ class PegTouchConfig:
     """True parameters over nominal ones; T_y and T_a keep the nominal ones. Paper, fig:1 c."""
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, tuple):
-                ordered = name == "u0" or value[0] <= value[1]
-                if len(value) != 2 or not np.isfinite(value).all() or not ordered:
-                    raise ValueError(f"{name}: wanted a finite (low, high), got {value}")
-        for name in ("tau_x", "tau_z", "h", "action_limit", "force_error_cap"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+        positive: tuple[str, ...] = ("tau_x", "tau_z", "h", "action_limit", "force_error_cap")
+        ranges = ("K_sur", "surface", "x_limits", "z_limits", "x_d", "f_d", "x0", "z0")
+        more = ("weight_x", "weight_f", "mount_angle")
+        set_numbers(self, dict.fromkeys((*ranges, "u0"), 2) | dict.fromkeys((*positive, *more), 0))
+        if self.stiffness_reference is not None:
+            set_numbers(self, {"stiffness_reference": 0})
+            positive = (*positive, "stiffness_reference")
+        for name in positive:
+            if getattr(self, name) <= 0.0:
                 raise ValueError(f"{name}: wanted a positive number, got {getattr(self, name)}")
+        for name in ranges:
+            low, high = getattr(self, name)
+            if low > high:
+                raise ValueError(f"{name}: wanted (low, high), got {(low, high)}")
         if self.K_sur[0] <= 0.0:
             raise ValueError(f"K_sur: wanted positive stiffnesses, got {self.K_sur}")
-        if self.stiffness_reference is not None and not self.stiffness_reference > 0.0:
-            raise ValueError(
-                f"stiffness_reference: wanted None or a positive number, "
-                f"got {self.stiffness_reference}"
-            )
-        if self.horizon < 1:
-            raise ValueError(f"horizon: wanted at least 1 step, got {self.horizon}")
+        object.__setattr__(self, "horizon", whole("horizon", self.horizon))
+        if not isinstance(self.shift, PegShift):
+            raise ValueError(f"shift: wanted a PegShift, got {self.shift!r}")
         if self.interface not in INTERFACES:
             raise ValueError(f"interface: wanted one of {INTERFACES}, got {self.interface!r}")
+
+    def observation_bounds(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Largest observations (4,) the limits and the horizon allow; generous, finite."""
+        c = self
+        stiffness, amplitude = c.K_sur[1], 2.0 * float(np.hypot(*np.abs(c.surface)))
+        force = (
+            stiffness * c.shift.K_sur * (max(map(abs, c.z_limits)) + c.shift.surface * amplitude)
+        )
+        if c.interface == "raw":
+            lowest = np.array([c.x_limits[0], -force, c.x_d[0], c.f_d[0]])
+            highest = np.array([c.x_limits[1], 0.0, c.x_d[1], c.f_d[1]])
+            return lowest.astype(np.float32), highest.astype(np.float32)
+        reach = max(c.x_limits[1], c.x_d[1], c.x0[1]) - min(c.x_limits[0], c.x_d[0], c.x0[0])
+        signal = np.array([reach, force + max(map(abs, c.f_d)) + stiffness * amplitude * reach])
+        time = (c.horizon + 1) * c.h
+        highest = 1.001 * np.stack([signal, time * signal], axis=-1).ravel()
+        return -highest.astype(np.float32), highest.astype(np.float32)

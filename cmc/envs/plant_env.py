@@ -1,0 +1,134 @@
+"""Any `Plant` as an environment: y' = f(y, u) under commands that are held, natively batched."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from numpy.typing import ArrayLike, NDArray
+
+from cmc import plants
+from cmc.envs.checks import checked, whole
+from cmc.envs.vector import Array32, Mask, NativeVectorEnv, Seed, SingleEnv, Step, without_pictures
+from cmc.plants import Plant
+
+Array = NDArray[np.float64]
+Reward = Callable[[Array, Array], Array]
+
+
+class PlantVectorEnv(NativeVectorEnv):
+    """Bring y to `target` from anywhere in the plant's box.
+
+    Every step holds the command u for h seconds, `substeps` steps of classical Runge-Kutta (RK4).
+
+    - Action: u (n,), clipped to the plant's `u_low` and `u_high`.
+    - Observation: y (n,), float32. With `AuxiliarySpaceWrapper` (of one trajectory) it becomes z.
+    - Reward: -mean over i of ((y_i - target_i) / half-width_i)^2, after the step; or `reward`.
+    - Start: uniform in `y_low` to `y_high`; `reset(options={"y": ...})` sets it, (n,) or (N, n).
+    - End: terminated where y leaves a box `room` times as wide; truncated after `horizon` steps.
+
+    Args:
+        num_envs: N.
+        plant: the plant, or a name of `cmc.plants`.
+        h: seconds for which a command is held.
+        target: y_d (n,); the middle of the box by default.
+        reward: maps y (N, n) after the step and the applied u (N, n) to rewards (N,).
+        horizon: steps of an episode.
+        substeps: of RK4 within h.
+        room: how far out y may go.
+        autoreset_mode: see `NativeVectorEnv`.
+        render_mode: None.
+
+    Attributes:
+        y: states (N, n). u: commands last applied (N, n).
+
+    Raises:
+        ValueError: where an argument is no number of the wanted kind, or f does not answer (N, n).
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        plant: Plant | str = "coupled_lags",
+        h: float = 0.02,
+        *,
+        target: ArrayLike | None = None,
+        reward: Reward | None = None,
+        horizon: int = 500,
+        substeps: int = 4,
+        room: float = 10.0,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        render_mode: str | None = None,
+    ) -> None:
+        without_pictures(render_mode)
+        self.plant = p = plants.get(plant) if isinstance(plant, str) else plant
+        self.h, room = float(checked(h, (), "h")), float(checked(room, (), "room"))
+        if self.h <= 0.0 or room < 1.0:
+            raise ValueError(f"wanted h > 0 and room >= 1, got h = {h} and room = {room}")
+        self.horizon, self.substeps = whole("horizon", horizon), whole("substeps", substeps)
+        middle, self._half = (p.y_low + p.y_high) / 2, (p.y_high - p.y_low) / 2
+        self.target = checked(middle if target is None else target, (p.n,), "target")
+        ends = (middle - room * self._half, middle + room * self._half)
+        seen = spaces.Box(ends[0].astype(np.float32), ends[1].astype(np.float32))
+        command = spaces.Box(p.u_low.astype(np.float32), p.u_high.astype(np.float32))
+        super().__init__(num_envs, seen, command, autoreset_mode)
+        self._ends, self._reward = ends, reward or self._quadratic
+        self.y, self.u = np.tile(middle, (num_envs, 1)), np.zeros((num_envs, p.n))
+        self.steps, self._streams = np.zeros(num_envs, dtype=int), [np.random.default_rng()]
+        self._rate()
+
+    def _quadratic(self, y: Array, u: Array) -> Array:
+        return -np.mean(((y - self.target) / self._half) ** 2, axis=-1)
+
+    def _rate(self) -> Array:
+        rate = np.asarray(self.plant.f(self.y, self.u), dtype=float)
+        if rate.shape != self.y.shape:
+            raise ValueError(f"f(y, u): wanted shape {self.y.shape}, got {rate.shape}")
+        return rate
+
+    def _seed(self, seed: Seed) -> None:
+        if isinstance(seed, Sequence) and self.num_envs % max(len(seed), 1) == 0 and len(seed):
+            self._streams = [np.random.default_rng(s) for s in seed]
+        elif isinstance(seed, Sequence):
+            raise ValueError(f"seed: wanted a number that divides {self.num_envs}, got {seed}")
+        elif seed is not None:
+            self._streams = [np.random.default_rng(seed)]
+
+    def _begin(self, mask: Mask, options: dict[str, Any]) -> Array32:
+        p, each = self.plant, self.num_envs // len(self._streams)
+        start = np.concatenate([s.uniform(p.y_low, p.y_high, (each, p.n)) for s in self._streams])
+        if "y" in options:
+            given = np.broadcast_to(np.asarray(options["y"], dtype=float), start.shape)
+            start = checked(given, start.shape, "y")
+        self.y = np.where(mask[:, None], start, self.y)
+        self.u, self.steps = np.where(mask[:, None], 0.0, self.u), np.where(mask, 0, self.steps)
+        return self.y.astype(np.float32)
+
+    def _advance(self, actions: ArrayLike) -> Step:
+        p, dt = self.plant, self.h / self.substeps
+        self.u = np.clip(checked(actions, self.y.shape, "actions"), p.u_low, p.u_high)
+        for _ in range(self.substeps):
+            k1 = np.asarray(p.f(self.y, self.u))
+            k2 = np.asarray(p.f(self.y + dt / 2 * k1, self.u))
+            k3 = np.asarray(p.f(self.y + dt / 2 * k2, self.u))
+            k4 = np.asarray(p.f(self.y + dt * k3, self.u))
+            self.y = self.y + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        low, high = self._ends
+        self.y = np.clip(np.nan_to_num(self.y, nan=np.inf), low, high)
+        self.steps = self.steps + 1
+        left = np.any((self.y <= low) | (self.y >= high), axis=-1)
+        reward = np.asarray(self._reward(self.y, self.u), dtype=float)
+        return self.y.astype(np.float32), reward, np.asarray(left), self.steps >= self.horizon, {}
+
+
+class PlantEnv(SingleEnv):
+    """One trajectory of a plant; everything else is documented at `PlantVectorEnv`."""
+
+    def __init__(
+        self, plant: Plant | str = "coupled_lags", h: float = 0.02, **options: Any
+    ) -> None:
+        super().__init__(PlantVectorEnv(1, plant, h, autoreset_mode="Disabled", **options))
+        self.plant = self.batch.plant
