@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from cmc.learning.hierarchy import HierarchyConfig
+from cmc.learning.hierarchy import HierarchyConfig, play
 from cmc.studies import peg_maze, peg_push
 from cmc.studies.two_level_parts import build
 
@@ -93,6 +93,32 @@ def test_critics_see_tip_and_sub_goal_from_the_goal(study):
     np.testing.assert_allclose(features[:, 9:12], np.tanh(1e3 * (tip - goal)), atol=2e-2)
     length = np.linalg.norm(1e3 * (task.target - goal), axis=-1)
     np.testing.assert_allclose(5 * features[:, 15], np.hypot(length, 0.1), atol=2e-2)
+
+
+def test_play_keeps_what_a_loop_by_hand_sees():
+    study = replace(peg_maze.STUDY, task=replace(peg_maze.STUDY.task, ticks=40))
+    trainer = build(study, "ctd3", [0, 1])
+    planner, planning = trainer.planner.actor, study.planning()
+    names = ("reward", "tip", "success", "distance", "target")
+    task, other = (study.task_class(study.task, num=4, seed=5) for _ in range(2))
+    kept = play(task, planning, planner, trainer.low, 2, names)
+    obs, rows = other.reset(), []
+    for tick in range(40):
+        if tick % 20 == 0:
+            seen = torch.as_tensor(planning.observe(other, obs).reshape(2, 2, -1)).float()
+            aim = planner(seen).detach().double().numpy().reshape(4, -1)
+            obs = other.set_subgoal(planning.subgoal(aim))
+        y, integral = (other.select(obs, (k,)).reshape(2, 2, 6) for k in ("latent", "integral"))
+        s = torch.as_tensor(np.stack([y, integral], -1)).float()
+        u = trainer.low.actor.network(s).tanh().detach()
+        obs, reward, _, _, info = other.step(u.double().numpy().reshape(4, 6))
+        rows.append((reward, other.worlds.tip.copy(), info["success"], other.target.copy()))
+    reward, tip, success, target = (np.array(part) for part in zip(*rows, strict=True))
+    np.testing.assert_allclose(kept["reward"].reshape(40, 4), reward, rtol=1e-5)
+    np.testing.assert_allclose(kept["tip"].reshape(40, 4, 3), tip, atol=1e-7)
+    np.testing.assert_allclose(kept["target"].reshape(40, 4, 3), target, atol=1e-7)
+    np.testing.assert_array_equal(kept["success"].reshape(40, 4), success)
+    np.testing.assert_allclose(kept["distance"].reshape(40, 4), -reward, rtol=1e-5)
 
 
 @pytest.mark.parametrize(

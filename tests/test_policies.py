@@ -11,6 +11,7 @@ from cmc.policies import (
     DirectPolicy,
     IndependentNetwork,
     JointNetwork,
+    LinearNetwork,
     ModularPolicy,
     NegativeWeightError,
     PositiveNetwork,
@@ -233,6 +234,34 @@ def test_observation_layout():
         direct(signals(3, 2))
 
 
+APART = {"z": slice(0, 2), "integral": slice(2, 4)}
+
+
+def test_signals_and_integrals_may_stand_apart_and_commands_may_be_bounded():
+    network = PositiveNetwork(2, seeds=[0, 1], dtype=f64)
+    s = signals(2, 6, 2, 2)
+    policy = ModularPolicy(network, layout=APART, R=[-1.0, 1.0], squash=True)
+    found = policy(torch.cat([s[..., 0], s[..., 1]], -1))
+    sign = torch.tensor([1.0, -1.0], dtype=f64)
+    torch.testing.assert_close(found, sign * torch.tanh(network(s)))
+    direct = DirectPolicy(JointNetwork(2, inputs=4, dtype=f64), squash=True)
+    flat = s.flatten(-2)
+    torch.testing.assert_close(direct(flat), torch.tanh(direct.unsquashed(flat)))
+
+
+def test_fixed_gains():
+    gains = np.array([[2.0, 40.0], [0.5, 8.0]])
+    network = LinearNetwork(gains, seeds=[0, 1])
+    s = signals(2, 5, 2, 2).float()
+    expected = (s * torch.tensor(gains, dtype=torch.float32)).sum(-1)
+    torch.testing.assert_close(ModularPolicy(network)(s.flatten(-2)), -expected)
+    np.testing.assert_allclose(as_numpy(ModularPolicy(network))(s.flatten(-2).numpy()), -expected)
+    assert [bound.shape for bound in network.slope_bounds()] == [(2, 2, 2)] * 2
+    assert not network.state_dict()
+    with pytest.raises(ValueError, match="gains"):
+        LinearNetwork([1.0, 2.0])
+
+
 @pytest.mark.parametrize("seeds", [None, [3], [0, 1]])
 @pytest.mark.parametrize(
     "make",
@@ -244,6 +273,8 @@ def test_observation_layout():
         lambda **o: ModularPolicy(JointNetwork(2, **o), R=[-1.0, 2.0]),
         lambda **o: ModularPolicy(ConvexGradientNetwork(2, **o)),
         lambda **o: DirectPolicy(JointNetwork(2, inputs=3, **o), part=slice(1, 4), u0=[1, 2]),
+        lambda **o: DirectPolicy(JointNetwork(2, inputs=4, **o), squash=True),
+        lambda **o: ModularPolicy(PositiveNetwork(2, **o), layout=APART, R=-1.0, squash=True),
     ],
 )
 def test_the_numpy_function_equals_the_module(make, seeds):

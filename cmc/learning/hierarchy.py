@@ -9,17 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
 from cmc.envs.panda_task import CRITIC, PandaTask
+from cmc.learning.hiro import OffPolicyCorrection
 from cmc.learning.low_level import CriticLow, LowLevel, Segment, evaluate
 from cmc.learning.planning import Planning
 from cmc.learning.state import Arrays, Resumable, State, set_streams, streams, under, within
-from cmc.learning.td3 import TD3, Batch, Replay
+from cmc.learning.td3 import TD3, Replay
 
 Array = NDArray[np.float64]
 JOINT_STATE = ("joints", "joint_velocity", "joint_error")
@@ -80,7 +81,6 @@ class HierarchyConfig:
         noise = (self.high_noise, self.high_noise_end or 0.0)
         if min(noise) < 0 or self.noise_steps < 1:
             raise ValueError(f"wanted noise of at least 0 and noise_steps of at least 1: {self}")
-
         if not all(0 <= share <= 1 for share in (*self.redraw, *self.burst)):
             raise ValueError(f"redraw and burst: wanted probabilities, got {self}")
         if self.rate_steps is not None and not 0 <= self.rate_steps[0] < self.rate_steps[1]:
@@ -110,24 +110,6 @@ class HierarchyConfig:
         return int(done * self.high_updates), int(early * self.low_updates + late * rest)
 
 
-class Relabeller(Protocol):
-    """What stores a finished segment beside the planner's transition and relabels samples."""
-
-    size: int
-
-    def pack(self, segment: Segment) -> Array:
-        """What is stored with the transition, (seeds, N, size)."""
-
-    def relabel(self, batch: Batch) -> Batch:
-        """A sample with other sub-goals."""
-
-    def state(self) -> list[Any]:
-        """All that is needed to continue."""
-
-    def restore(self, state: list[Any]) -> None:
-        """Continue from `state`."""
-
-
 class TwoLevel(Resumable):
     """Trains a planner and a low level on one task, several seeds side by side.
 
@@ -149,7 +131,7 @@ class TwoLevel(Resumable):
         low: LowLevel,
         planning: Planning,
         config: HierarchyConfig,
-        relabeller: Relabeller | None = None,
+        relabeller: OffPolicyCorrection | None = None,
     ) -> None:
         if task.num != len(seeds) * config.worlds:
             raise ValueError(f"wanted {len(seeds)} x {config.worlds} worlds, got {task.num}")

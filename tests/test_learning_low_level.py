@@ -1,0 +1,65 @@
+"""Low levels: the slope they start from, the sign of what they do, and their older files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from cmc.learning.low_level import evaluate, latent_policy, set_gain
+from cmc.policies import IndependentNetwork, LinearNetwork, PositiveNetwork
+
+SEEDS = [3, 8]
+CAP = (np.array([1.0, 0.02]), np.full(6, 30.0))
+NETWORKS = {
+    "capped": lambda: PositiveNetwork(6, seeds=SEEDS, bias=False, joint_cap=CAP),
+    "with biases": lambda: PositiveNetwork(6, seeds=SEEDS),
+    "free": lambda: IndependentNetwork(6, seeds=SEEDS),
+}
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_every_network_can_start_from_the_same_slope(name):
+    gain = np.array([0.3, 0.3, 5.0, 20.0, 0.3, 1.0])
+    network = NETWORKS[name]()
+    before = [weight.detach().clone() for weight in network.mlp.weights]
+    set_gain(network, gain)
+    slope = network.jacobian(torch.zeros(2, 1, 6, 2))[:, 0, :, 0].detach().numpy()
+    np.testing.assert_allclose(slope, np.tile(gain, (2, 1)), rtol=1e-4)
+    if name != "with biases":  # these start away from zero, where the last tanh is flatter
+        seen = np.concatenate([1e-4 * np.ones((2, 1, 6)), np.zeros((2, 1, 6))], -1)
+        u = evaluate(latent_policy(network), seen)
+        np.testing.assert_allclose(u[:, 0] / 1e-4, np.tile(gain, (2, 1)), rtol=0.01)
+    for old, new in zip(before[:-1], network.mlp.weights, strict=False):
+        assert torch.equal(old, new)  # the last layer alone was moved
+
+
+def test_free_networks_keep_most_of_their_start():
+    network = NETWORKS["free"]()
+    last = network.mlp.weights[-1].detach().clone()
+    set_gain(network, 0.3)
+    moved = network.mlp.weights[-1].detach() - last
+    x = torch.tensor([[[1e-3, 0.0]]]).repeat(12, 1, 1)
+    h = network.mlp.hidden_values(x, list(network.mlp.weights))[-2] / 1e-3
+    # the smallest change that gives the slope lies along h
+    along = (moved[..., 0] * h[:, 0]).sum(-1) / h[:, 0].norm(dim=-1)
+    torch.testing.assert_close(along.abs(), moved[..., 0].norm(dim=-1), rtol=1e-3, atol=1e-5)
+
+
+def test_positive_slopes_pull_towards_the_sub_goal_and_stay_within_one():
+    actor = latent_policy(LinearNetwork(np.tile([2.0, 3.0], (6, 1))))
+    y = np.random.default_rng(0).normal(size=(2, 5, 6))
+    integral = np.random.default_rng(1).normal(size=(2, 5, 6))
+    seen = np.concatenate([y, integral, np.ones((2, 5, 13))], -1)
+    np.testing.assert_allclose(evaluate(actor, seen), np.tanh(2 * y + 3 * integral), atol=1e-6)
+
+
+def test_older_files_name_the_network_otherwise():
+    source, target = (latent_policy(NETWORKS[name]()) for name in ("capped", "capped"))
+    with torch.no_grad():
+        for parameter in source.parameters():
+            parameter.mul_(1.5)
+    old = {key.replace("network.", "net.", 1): v for key, v in source.state_dict().items()}
+    target.load_state_dict(old)
+    for a, b in zip(source.parameters(), target.parameters(), strict=True):
+        assert torch.equal(a.abs(), b)
