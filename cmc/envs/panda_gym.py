@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
@@ -201,14 +203,24 @@ class PandaVectorEnv(NativeVectorEnv):
         return self.task.restore(snapshot).astype(np.float32)
 
 
+_failures: list[str] = []
+"""Why there are no graphics: a second attempt to start them aborts the whole process."""
+
+
 def _renderer(task: PandaTask) -> mujoco.Renderer:
-    try:
-        return mujoco.Renderer(task.worlds.model, 480, 640)
-    except Exception as error:  # EGL, GLFW and OSMesa raise whatever they like
-        raise RuntimeError(
-            f"render_mode 'rgb_array' needs graphics (MUJOCO_GL: egl, glfw or osmesa): {error}; "
-            "cmc.view.playback.record makes a 3D page of a motion without any"
-        ) from error
+    windows = sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "MUJOCO_GL")))
+    if not windows and not _failures:
+        _failures.append("neither DISPLAY nor MUJOCO_GL is set")
+    if not _failures:
+        try:
+            return mujoco.Renderer(task.worlds.model, 480, 640)
+        except Exception as error:  # EGL, GLFW and OSMesa raise whatever they like
+            _failures.append(str(error))
+    raise RuntimeError(
+        f"render_mode 'rgb_array' needs graphics, and there are none: {_failures[0]}. Set "
+        "MUJOCO_GL=egl (or osmesa) before Python starts, or let cmc.view.playback.record make a "
+        "3D page of the motion"
+    )
 
 
 def observation_space(task: PandaTask) -> Any:
