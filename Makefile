@@ -24,7 +24,7 @@ help:
 	@echo "make clean    remove .venv, caches and build products"
 
 course: $(VENV)/.course-installed
-	@$(BIN)/python -m cmc.course --port $(PORT)
+	@JUPYTER_CONFIG_PATH="$(CURDIR)/assets/jupyter" $(BIN)/python -m jupyterlab --port $(PORT)
 
 test: lint types unit notebooks
 	@echo "All checks passed."

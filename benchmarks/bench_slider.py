@@ -67,7 +67,7 @@ def explorer(frames: bool) -> Any:
 def figure_ms() -> float:
     """Median CPU time of a new inline figure of the same data, ms."""
     from cmc.view import style
-    from cmc.view.motion import trajectories
+    from cmc.view.figures import trajectories
 
     times = []
     for damping in np.linspace(0.2, 1.0, 5):

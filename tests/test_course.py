@@ -14,17 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from cmc import course
-
 ROOT = Path(__file__).resolve().parent.parent
-
-
-@pytest.fixture
-def taken_port():
-    with socket.socket() as holder:
-        holder.bind(("127.0.0.1", 0))
-        holder.listen()
-        yield holder.getsockname()[1]
 
 
 def free_port() -> int:
@@ -33,42 +23,48 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def test_a_taken_port_gets_one_sentence(taken_port: int, capsys) -> None:
-    assert course.main(["--port", str(taken_port)]) == 2
-    (line,) = capsys.readouterr().out.splitlines()
-    assert f"Port {taken_port} is taken" in line
-    assert "make course PORT=" in line
-
-
-def test_a_number_that_is_no_port_gets_one_sentence(capsys) -> None:
-    assert course.main(["--port", "70000"]) == 2
-    assert "not a port" in capsys.readouterr().out
-
-
-def test_root_and_headless_are_arguments_of_the_lab() -> None:
-    plain = course.lab_arguments(Path("notebooks"), 8888, root=False, browser=True)
-    root = course.lab_arguments(Path("notebooks"), 8888, root=True, browser=False)
-    assert set(root) - set(plain) == {"--allow-root", "--no-browser"}
-    assert "--ServerApp.ip=127.0.0.1" in plain
+def test_make_starts_the_lab_with_the_course_s_settings() -> None:
+    command = next(line for line in (ROOT / "Makefile").read_text().splitlines() if "lab" in line
+                   and line.startswith("\t@JUPYTER"))  # fmt: skip
+    assert 'JUPYTER_CONFIG_PATH="$(CURDIR)/assets/jupyter"' in command
+    assert command.endswith("$(BIN)/python -m jupyterlab --port $(PORT)")
 
 
 def test_the_lab_serves_the_first_notebook_on_loopback_with_a_token(tmp_path: Path) -> None:
     port = free_port()
-    environment = {**os.environ, "JUPYTER_TOKEN": "letmein", "HOME": str(tmp_path)}
+    environment = {
+        **os.environ,
+        "JUPYTER_TOKEN": "letmein",
+        "HOME": str(tmp_path),
+        "JUPYTER_CONFIG_PATH": str(ROOT / "assets" / "jupyter"),
+    }
     server = subprocess.Popen(
-        [sys.executable, "-m", "cmc.course", "--no-browser", "--port", str(port)],
+        [sys.executable, "-m", "jupyterlab", "--no-browser", "--port", str(port)],
         env=environment,
-        cwd=ROOT,
+        cwd=tmp_path,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
     try:
-        url = f"http://127.0.0.1:{port}/api/contents/{course.FIRST}?content=0"
+        url = f"http://127.0.0.1:{port}/api/contents/00_start_here.ipynb?content=0"
         wait_for(f"http://127.0.0.1:{port}/api", server)
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(url, timeout=10)
         with urllib.request.urlopen(f"{url}&token=letmein", timeout=10) as answer:
-            assert course.FIRST in answer.read().decode()
+            assert "00_start_here.ipynb" in answer.read().decode()
+        with socket.socket() as probe:  # a server on all interfaces would answer here
+            assert probe.connect_ex(("127.0.0.2", port)) != 0
+        again = subprocess.run(
+            [sys.executable, "-m", "jupyterlab", "--no-browser", "--port", str(port)],
+            env=environment,
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert again.returncode != 0
+        assert f"port {port} is not available" in again.stderr
     finally:
         server.terminate()
         server.wait(timeout=30)

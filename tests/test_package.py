@@ -29,8 +29,8 @@ ORDER = [
     "plants",
     "theory",
 ]
-LEAVES = {"store", "fast", "notation"}
-ALONE = {"view", "course"}
+LEAVES = {"store", "fast"}
+ALONE = {"view", "notation"}
 
 
 def room(path: Path) -> str:

@@ -1,7 +1,7 @@
 """One look for every figure, and one line of text under each of them.
 
-Colors are Okabe and Ito's (https://jfly.uni-koeln.de/color/), which stay apart for the common
-forms of color blindness.
+The look is in `assets/cmc.mplstyle`. Colors are Okabe and Ito's
+(https://jfly.uni-koeln.de/color/), which stay apart for the common forms of color blindness.
 """
 
 from __future__ import annotations
@@ -10,16 +10,15 @@ import base64
 import html
 import io
 import itertools
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-from cycler import cycler
 
-from cmc.store import write_atomic
+from cmc.store import asset, write_atomic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,6 +50,13 @@ _METHODS = {
     "td3_corrected": ("TD3/TD3, corrected critic", "#CC79A7", "--"),
     "control": ("TD3/Control", "#222222", ":"),
     "ppo_control": ("PPO/Control", "#7A7A7A", ":"),
+    "ctd3_tuned": ("TD3/C-TD3, tuned start", "#332288", "-"),
+    "frozen_tuned": ("TD3/frozen random C, tuned start", "#999933", "-"),
+    "ctd3_positive": ("TD3/C-TD3, corrected critic", "#88CCEE", "-."),
+    "ctd3_short": ("TD3/C-TD3, discount .5", "#117733", "-."),
+    "ctd3_plain_view": ("TD3/C-TD3, plain view", "#DDCC77", "-."),
+    "ctd3_no_bursts": ("TD3/C-TD3, Gaussian noise alone", "#AA4499", "-."),
+    "ctd3_no_pull": ("TD3/C-TD3, no pull", "#661100", "-."),
     "hiro": ("HIRO", "#5E3C99", "-."),
     "hiro_matched": ("HIRO, matched noise", "#A79BD0", "-."),
     # one level: the peg that touches
@@ -106,36 +112,8 @@ def looks(labels: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def use_style() -> None:
-    """Set matplotlib's defaults for the course (colors, fonts, grid, layout)."""
-    mpl.rcParams.update(
-        {
-            "axes.prop_cycle": cycler(color=CYCLE),
-            "figure.figsize": (7.0, 3.6),
-            "figure.dpi": 100,
-            "savefig.dpi": _DPI,
-            "figure.constrained_layout.use": True,
-            "figure.facecolor": "white",
-            "font.family": "DejaVu Sans",
-            "font.size": 11,
-            "mathtext.fontset": "dejavusans",
-            "axes.titlesize": 12,
-            "axes.titlelocation": "left",
-            "axes.labelsize": 11,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "axes.edgecolor": "#555555",
-            "axes.grid": True,
-            "axes.axisbelow": True,
-            "grid.color": "#E4E4E4",
-            "grid.linewidth": 0.8,
-            "lines.linewidth": 1.8,
-            "legend.frameon": False,
-            "legend.fontsize": 10,
-            "xtick.color": "#444444",
-            "ytick.color": "#444444",
-            "image.cmap": "cividis",
-        }
-    )
+    """Set matplotlib's defaults for the course, from `assets/cmc.mplstyle`."""
+    plt.style.use(asset("cmc.mplstyle"))
 
 
 def panels(
@@ -195,46 +173,73 @@ def save(fig: Figure, path: str | Path, text: str = "") -> Path:
     return write_atomic(path, lambda file: file.write(data))
 
 
-class Described:
-    """A figure as bytes, with the line of text that says what it shows."""
+class Picture:
+    """An image as bytes, with the line of text that says what it shows."""
 
-    def __init__(self, data: bytes, text: str, width: int) -> None:
-        self.data, self.text, self.width = data, text, width
+    def __init__(self, data: bytes, text: str, width: int, kind: str = "image/png") -> None:
+        self.data, self.text, self.width, self.kind = data, text, width, kind
 
     def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
         encoded = base64.b64encode(self.data).decode()
         words = html.escape(self.text, quote=True)
         return {
-            "image/png": encoded,
+            **({"image/png": encoded} if self.kind == "image/png" else {}),
             "text/html": (
                 f'<figure style="margin:0.4em 0"><img alt="{words}" width="{self.width}" '
-                f'style="max-width:100%" src="data:image/png;base64,{encoded}">'
-                f'<figcaption style="font-size:0.95em;color:#555;max-width:52em">{words}'
+                f'style="max-width:100%" src="data:{self.kind};base64,{encoded}">'
+                f'<figcaption style="font-size:0.95em;color:#777;max-width:52em">{words}'
                 "</figcaption></figure>"
             ),
             "text/plain": f"Figure: {self.text}",
         }
 
 
-def describe(fig: Figure, text: str) -> None:
+def describe(fig: Figure | Picture, text: str) -> None:
     """Show a figure with one line under it that says what is to be seen, then close it.
 
     The line is the image's alternative text too. Outside of IPython nothing is shown; the text is
     kept as the figure's label either way.
-
-    Args:
-        fig: the figure.
-        text: one plain sentence or two, without a line break.
 
     Raises:
         ValueError: if the text is empty or longer than one line.
     """
     if not text.strip() or "\n" in text:
         raise ValueError(f"wanted one line that describes the figure, got {text!r}")
+    if isinstance(fig, Picture):
+        _display(Picture(fig.data, text, fig.width, fig.kind))
+        return
     fig.set_label(text)
     width = round(fig.get_size_inches()[0] * _CSS_PIXELS_PER_INCH)
-    picture = Described(png(fig, text), text, width)
+    picture = Picture(png(fig, text), text, width)
     plt.close(fig)
+    _display(picture)
+
+
+def schematic(name: str, text: str | None = None) -> None:
+    """Show a schematic of `assets/schematics` with its description, or with `text` in its place.
+
+    Raises:
+        ValueError: if there is no such schematic.
+    """
+    picture = drawing(name)
+    describe(picture, text or picture.text)
+
+
+def drawing(name: str) -> Picture:
+    """A schematic as a picture, with the description that its file holds."""
+    folder = asset("schematics")
+    if not (folder / f"{name}.svg").is_file():
+        there = sorted(file.stem for file in folder.glob("*.svg"))
+        raise ValueError(f"no schematic {name!r}; there are {there}")
+    source = (folder / f"{name}.svg").read_text("utf-8")
+    title, points = (re.search(p, source) for p in ("<title>(.*?)</title>", r'width="([\d.]+)pt"'))
+    assert title is not None
+    assert points is not None
+    width = round(float(points[1]) / 72 * _CSS_PIXELS_PER_INCH)
+    return Picture(source.encode(), html.unescape(title[1]), width, "image/svg+xml")
+
+
+def _display(picture: Picture) -> None:
     try:
         from IPython import get_ipython
         from IPython.display import display
