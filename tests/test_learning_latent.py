@@ -29,19 +29,20 @@ class Linear(nn.Module):
         return torch.tanh((s * self.gain).sum(-1, keepdim=True))
 
 
-def one_axis(**options) -> LatentLow:
+def one_axis(delay: int = 0, **options) -> LatentLow:
     values = (K_P, K_D, K1, K2, ACTION, MASS, 1.0)
-    model = LatentModel(*(np.array([value]) for value in values), tick=TICK)
+    model = LatentModel(*(np.array([value]) for value in values), tick=TICK, delay=delay)
     return LatentLow(Linear(), [0], model, TICKS, LatentConfig(**options))
 
 
-def reference(e: float, v: float, push: float) -> list[float]:
+def reference(e: float, v: float, push: float, delay: int = 0) -> list[float]:
     """Errors at the end of every tick, integrated by another method."""
-    integral, errors = 0.0, []
+    integral, errors, late = 0.0, [], [0.0] * delay
     for _ in range(TICKS):
         y = K1 * e + K2 * v
         integral += TICK * y
-        u = np.tanh(3.0 * y + 5.0 * integral)
+        late.append(np.tanh(3.0 * y + 5.0 * integral))
+        u = late.pop(0)
 
         def rhs(t, x, u=u):
             return [x[1], -K_D * x[1] - K_P * x[0] - ACTION * (u + push)]
@@ -51,11 +52,12 @@ def reference(e: float, v: float, push: float) -> list[float]:
     return errors
 
 
-@pytest.mark.parametrize("push", [0.0, 0.4, -0.2])
-def test_a_free_rollout_costs_the_error_of_the_differential_equation(push):
+@pytest.mark.parametrize(("push", "delay"), [(0.0, 0), (0.4, 0), (-0.2, 1), (0.1, 3)])
+def test_a_free_rollout_costs_the_error_of_the_differential_equation(push, delay):
     start, free, pushes = [[[0.003, -0.02]]], [[[False]]], [[[push]]]
-    loss = one_axis().loss(torch.tensor(start), torch.tensor(free), torch.tensor(pushes))
-    errors = reference(0.003, -0.02, push)
+    low = one_axis(delay)
+    loss = low.loss(torch.tensor(start), torch.tensor(free), torch.tensor(pushes))
+    errors = reference(0.003, -0.02, push, delay)
     assert loss.item() == pytest.approx(np.mean(np.abs(errors)) / 0.003, rel=1e-4)
 
 

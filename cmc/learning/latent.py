@@ -69,6 +69,7 @@ class LatentModel:
         mass: effective mass that presses where an axis is blocked, kg; 0 where it never is.
         integrates: 1 where the integral acts, 0 elsewhere.
         tick: control period, s.
+        delay: ticks by which actions come late.
     """
 
     K_p: Array
@@ -79,6 +80,7 @@ class LatentModel:
     mass: Array
     integrates: Array
     tick: float
+    delay: int = 0
 
     def transition(self) -> tuple[Array, Array]:
         """Exact step of (e, e') under a held action in [-1, 1]: (n, 2, 2) and (n, 2)."""
@@ -121,7 +123,9 @@ class LatentLow:
         motion, push = model.transition()
         self._motion, self._push = _tensor(motion), _tensor(push)
         self._constants = {
-            name: _tensor(value) for name, value in asdict(model).items() if name != "tick"
+            name: _tensor(value)
+            for name, value in asdict(model).items()
+            if name not in ("tick", "delay")
         }
 
     def act(self, observation: Array, explore: bool) -> Array:
@@ -170,12 +174,13 @@ class LatentLow:
         unit = torch.ones_like(c["K_p"])
         unit[3:] = 1.0 / config.rotation_scale
         size = (e * unit).norm(dim=-1, keepdim=True).clamp(min=1e-3)
-        integral = torch.zeros_like(e)
+        integral, late = torch.zeros_like(e), [torch.zeros_like(e)] * self.model.delay
         cost = torch.zeros(e.shape[:-1])
         for _ in range(self.horizon):
             y = c["K1"] * e + c["K2"] * v  # mapping_pos
             integral = integral + self.model.tick * c["integrates"] * y
-            u = self.actor(torch.cat([y, integral], dim=-1))
+            late.append(self.actor(torch.cat([y, integral], dim=-1)))
+            u = late.pop(0)
             press = c["mass"] * (c["K_p"] * e + c["action"] * u).abs() * blocked
             step = torch.einsum("...nj,nij->...ni", torch.stack([e, v], -1), self._motion)
             step = step + self._push * (u + pushes)[..., None]
