@@ -4,24 +4,30 @@ import numpy as np
 import pytest
 import torch
 
+from cmc import plants
 from cmc.policies import PositiveNetwork
 from cmc.theory.auxiliary import (
     AuxiliarySpace,
     ComplexEigenvalueError,
     DefectiveMatrixError,
     SingularInputError,
+    decompose,
 )
+from cmc.theory.certificates import rate_in
+from cmc.theory.certify import certify
 from cmc.theory.combinations import (
+    block_schur,
     coupling_skewness,
     feedback,
     feedback_gain,
-    hierarchical,
     possible_combinations,
     real_block_form,
     schur,
 )
 from cmc.theory.differential import F, subsystems
+from cmc.theory.jacobians import differences
 from cmc.theory.margins import slope_floor, symmetric_bound, theorem2_margin
+from cmc.theory.simulate import Loop
 
 
 def random_spirals(number, seed=0, real=(-5.0, -0.05)):
@@ -174,7 +180,7 @@ def test_counting_unknowns_proves_nothing_for_a_complex_pair():
         T_y = rng.normal(size=(2, 2))
         A = T_y @ f_y @ np.linalg.inv(T_y)
         assert (A[:, 0, 1] * A[:, 1, 0] <= -(w**2) * (1.0 - 1e-6)).all()
-    for build in (hierarchical, schur):
+    for build in (decompose, schur):
         with pytest.raises(ComplexEigenvalueError, match="feedback"):
             build(f_y[0], np.eye(2))
 
@@ -207,14 +213,20 @@ def answers(f_y, f_u):
 def test_possible_combinations():
     f_u = np.array([[1.0, 0.3], [-0.5, 1.2]])
     real, spiral = np.array([[-2.0, 1.0], [0.5, -1.0]]), np.array([[-0.4, 2.0], [-2.0, -0.4]])
-    assert answers(real, f_u)[0] == [True, True, True, True]
-    assert answers(spiral, f_u)[0] == [False, False, True, True]
-    assert answers(np.array([[-1.0, 1.0], [0.0, -1.0]]), f_u)[0] == [False, True, False, False]
+    assert answers(real, f_u)[0] == [True] * 5
+    assert answers(spiral, f_u)[0] == [False, False, True, True, True]
+    assert answers(np.array([[-1.0, 1.0], [0.0, -1.0]]), f_u)[0] == [
+        False,
+        True,
+        False,
+        False,
+        True,
+    ]
     flags, found = answers(spiral + np.eye(2), f_u)
-    assert flags == [False, False, True, False]
+    assert flags == [False, False, True, False, True]
     assert "0.6" in found["feedback (policies)"].reason
     flags, found = answers(real, np.ones((2, 2)))
-    assert flags == [False] * 4
+    assert flags == [False] * 5
     assert "singular" in found["schur"].reason
     with pytest.raises(ValueError, match="one plant"):
         possible_combinations(np.stack([real, real]), f_u)
@@ -232,3 +244,43 @@ def test_errors():
         feedback(spiral * np.nan, np.eye(2))
     with pytest.raises(ValueError, match="slopes"):
         feedback(spiral, np.eye(2), np.ones(2))
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 6])
+def test_block_schur_is_a_hierarchy_of_modes_and_rotations(n):
+    rng = np.random.default_rng(n)
+    for _ in range(50):
+        f_y, f_u = rng.normal(size=(2, n, n))
+        built = block_schur(f_y, f_u)
+        space = AuxiliarySpace.from_transforms(built.T_y, built.T_a, f_y, f_u)
+        np.testing.assert_allclose(space.Lambda, built.Lambda, atol=1e-7)
+        np.testing.assert_allclose(space.R, np.eye(n), atol=1e-7)
+        below = np.diagonal(built.Lambda, -1)
+        assert (np.abs(np.tril(built.Lambda, -2)) < 1e-9).all()
+        for k in np.flatnonzero(np.abs(below) > 1e-9):  # a rotation, w > 0
+            block = built.Lambda[k : k + 2, k : k + 2]
+            np.testing.assert_allclose(block[0, 1], -block[1, 0], rtol=1e-6)
+            np.testing.assert_allclose(block[0, 0], block[1, 1], rtol=1e-6, atol=1e-9)
+            assert block[0, 1] > 0
+
+
+@pytest.mark.parametrize("h", [None, 0.05])
+def test_a_defective_complex_pair_is_certified_as_a_hierarchy_of_rotations(h):
+    from test_theory_certify import policy
+
+    pair = np.array([[-1.5, 1.0], [-1.0, -1.5]])
+    A = np.block([[pair, np.eye(2)], [np.zeros((2, 2)), pair]])
+    Q = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0]
+    plant = plants.LinearPlant(Q @ A @ Q.T, np.eye(4) + 0.3 * Q)
+    space = block_schur(plant.A, plant.B)
+    with pytest.raises(DefectiveMatrixError):
+        feedback(plant.A, plant.B)
+    pol = policy((0.8, 0.5), (0.2, 0.1), n=4)
+    answer = certify(pol, plant, transforms=space, h=h)
+    assert answer, str(answer)
+    s = np.random.default_rng(1).normal(size=(200, 8)) * 3
+    loop = Loop(plant, pol, space)
+    move = (lambda x: loop.field(0.0, x)) if h is None else (lambda x: loop.step(x, h))
+    to_aux = np.block([[space.T_y, np.zeros((4, 4))], [np.zeros((4, 4)), np.eye(4)]])
+    J = to_aux @ differences(move, s) @ np.linalg.inv(to_aux)
+    assert rate_in(J, answer.metric, h) >= answer.rate - 1e-6

@@ -36,6 +36,7 @@ from cmc.theory.certificates import (
     compose_hierarchical,
     rate_in,
 )
+from cmc.theory.combinations import transforms_that_fit
 from cmc.theory.exact import Region, certify_exact
 from cmc.theory.jacobians import jacobian_fault, require_square
 from cmc.theory.sampled import hold
@@ -103,13 +104,16 @@ def certify(
         spaces = transforms_of(plant, transforms, np.mean(box.corners, axis=0))
         centre = spaces(np.mean(box.corners, axis=0))
     except (ValueError, np.linalg.LinAlgError) as error:
-        return refuse(error)
+        return refuse(f"{error}{_instead(plant, transforms)}")
     if (centre.gains == 0).any():
         return refuse("R has a zero on its diagonal: some action does not move its own signal")
     if kind == "frozen" and (callable(transforms) or not plant.constant):
         return _frozen(policy, spaces, box, h)
     if callable(transforms) or not plant.constant:
-        return certify_exact(policy, plant, spaces, box, h=h, y_ref=y_ref)
+        answer = certify_exact(policy, plant, spaces, box, h=h, y_ref=y_ref)
+        if answer.refused:
+            return replace(answer, reason=f"{answer.reason}{_instead(plant, transforms)}")
+        return answer
     try:
         answer = _everywhere(policy, plant, centre, h, y_ref)
     except TypeError:
@@ -122,6 +126,16 @@ def certify(
         return answer
     inside = certify_exact(policy, plant, spaces, box, h=h, y_ref=y_ref)
     return replace(inside, reason=f"{inside.reason}. Not everywhere: {answer.reason}")
+
+
+def _instead(plant: Any, transforms: Any) -> str:
+    """Which other transforms fit the plant's box, as a clause, or ""."""
+    if transforms is not None:
+        return ""
+    found = [option.name for option in transforms_that_fit(plant) if option.possible]
+    if not found:
+        return ""
+    return f" (what fits: {', '.join(found)}; see combinations.transforms_that_fit)"
 
 
 def _everywhere(

@@ -23,6 +23,7 @@ from cmc.theory.ball import ball_in_box
 from cmc.theory.certificates import Certificate, Domain, common_metric, rates_in
 from cmc.theory.jacobians import differences
 from cmc.theory.simulate import Loop
+from cmc.theory.tracking import jumps
 
 total_jacobian = differences
 
@@ -150,7 +151,7 @@ def certify_exact(
     n, (low, high) = plant.n, region.limits
     step, rng = 1e-6 * (high - low), np.random.default_rng(0)
     try:
-        if _jumps(spaces, region):
+        if jumps(spaces, *region.corners):
             return refuse(
                 "T_y jumps inside the region (order or sign of its eigenvectors): track them along "
                 "the path, or shrink the region"
@@ -220,14 +221,3 @@ def _integrates(loop: Loop, low: Array, high: Array) -> bool:
     other = s.copy()
     other[:, loop.n :] *= -0.37
     return bool((loop.field(0.0, s) != loop.field(0.0, other)).any())
-
-
-def _jumps(spaces: Transforms, region: Region) -> bool:
-    """Whether points a hundredth of the box apart disagree about an eigenvector by over 60 deg."""
-    low, high = region.corners
-    a, b = np.random.default_rng(2).uniform(low, high, (2, 256, len(low)))
-    t = np.linspace(0, 1, 25)[:, None, None]
-    y = a + t * (b - a)
-    V = np.linalg.inv(np.broadcast_to(spaces(y).T_y, (*y.shape, y.shape[-1])))
-    V = V / np.linalg.norm(V, axis=-2, keepdims=True)
-    return bool(((V[1:] * V[:-1]).sum(axis=-2) < 0.5).any())

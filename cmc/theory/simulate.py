@@ -78,9 +78,13 @@ def flow(
     if len(times) < 2 or not (np.diff(times) > 0).all():
         raise ValueError(f"t needs at least 2 increasing values, got {times}")
     path = np.empty((len(times), *s.shape))
-    path[0], now, step, steps = s, float(times[0]), float(times[1] - times[0]), 0
+    path[0], now, steps = s, float(times[0]), 0
     batch, first = tuple(range(s.ndim - 1)), rhs(now, s)
     largest = np.abs(s).max(axis=batch, initial=0.0)
+    speed = np.abs(first).max(axis=batch, initial=0.0)
+    # a first step that moves nothing by more than a hundredth of the whole state
+    step = float(times[1] - times[0])
+    step = min(step, 0.01 * float(largest.max() / max(speed.max(), 1e-300)) or step)
     for i, end in enumerate(times[1:], 1):
         while now < end:
             h, k = min(step, end - now), [first]

@@ -8,6 +8,8 @@ keeps its own place. Lengths are one throughout.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import linear_sum_assignment
@@ -136,6 +138,18 @@ def aligned(f_y: ArrayLike, f_u: ArrayLike, like: AuxiliarySpace) -> AuxiliarySp
     along = np.diagonal(_shares(inverse(like.T_y), V), axis1=-2, axis2=-1)
     V = V * np.where(along < 0.0, -1.0, 1.0)[..., None, :]
     return assemble(np.take_along_axis(eigenvalues, order, axis=-1), V, f_u)
+
+
+def jumps(spaces: Callable[[Array], AuxiliarySpace], low: Array, high: Array) -> bool:
+    """Whether an eigenvector turns by over 60 degrees from one point to the next inside a box.
+
+    Looked at on 256 straight lines of 25 points between random points of the box.
+    """
+    a, b = np.random.default_rng(2).uniform(low, high, (2, 256, len(low)))
+    y = a + np.linspace(0, 1, 25)[:, None, None] * (b - a)
+    V = np.linalg.inv(np.broadcast_to(spaces(y).T_y, (*y.shape, y.shape[-1])))
+    V = V / np.linalg.norm(V, axis=-2, keepdims=True)
+    return bool(((V[1:] * V[:-1]).sum(axis=-2) < 0.5).any())
 
 
 def _shares(before: Array, after: Array) -> Array:
