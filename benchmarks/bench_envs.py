@@ -7,6 +7,9 @@ repeats that take turns. `share` rows give raw speed reached by control at every
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -25,6 +28,7 @@ REPEATS = 15
 
 def run() -> Iterator[dict[str, str | float]]:
     """Rows: ratio to raw physics per tick (below 1 for `share` rows: raw speed reached)."""
+    yield _first()
     for name, (task, config) in CASES.items():
         every = replace(config, hold=False)
         calls = {
@@ -32,6 +36,7 @@ def run() -> Iterator[dict[str, str | float]]:
             "one": (_ticks(task(config, 1)), 1),
             "gym": (_gym(name), 1),
             "many": (_ticks(task(config, 32)), 32),
+            "shared": (_ticks(task(config, 32, threads=os.cpu_count() or 1)), 32),
             "every": (_ticks(task(every, 1)), 1),
             "every_many": (_ticks(task(every, 32)), 32),
         }
@@ -41,12 +46,32 @@ def run() -> Iterator[dict[str, str | float]]:
         yield {"name": f"{name}: one world", "ratio": cost["one"] / raw, "us": 1e6 * cost["one"]}
         yield {"name": f"{name}: through gymnasium", "ratio": cost["gym"] / raw}
         yield {"name": f"{name}: 32 worlds, each", "ratio": cost["many"] / raw}
-        yield {"name": f"{name}: 32 worlds against one", "ratio": cost["many"] / cost["one"]}
+        yield {"name": f"{name}: same, threads, CPU time", "ratio": cost["shared"] / raw}
         yield {"name": f"{name}: control at every step, share", "ratio": raw / cost["every"]}
         yield {"name": f"{name}: same, 32 worlds, share", "ratio": raw / cost["every_many"]}
     yield _plan()
     for name, (task, config) in {**CASES, "maze_joint": (PegMaze, JOINT)}.items():
         yield {"name": f"{name}: 10^5 random ticks", **_drive(task(config, 32, seed=0))}
+
+
+def _first() -> dict[str, str | float]:
+    """CPU seconds of a fresh process that does one tick, against one that imports MuJoCo only."""
+    imports = "import mujoco, numpy as np"
+    tick = (
+        f"{imports}; from cmc.envs.peg_maze import STIFF, PegMaze; "
+        "PegMaze(STIFF).step(np.zeros((1, 6)))"
+    )
+    seconds = {imports: np.inf, tick: np.inf}
+    for _ in range(3):
+        for code in seconds:
+            before = os.times()
+            subprocess.run([sys.executable, "-c", code], check=True)
+            after = os.times()
+            used = after.children_user + after.children_system
+            used -= before.children_user + before.children_system
+            seconds[code] = min(seconds[code], used)
+    ratio = seconds[tick] / seconds[imports]
+    return {"name": "first tick of a process, cache warm", "ratio": ratio, "s": seconds[tick]}
 
 
 def _raw(task: PandaTask) -> Callable[[], object]:
@@ -121,7 +146,7 @@ def _plan(ticks: int = 300) -> dict[str, str | float]:
 def _best(calls: dict[str, Callable[[], object]]) -> dict[str, float]:
     """CPU seconds per call, best of the repeats."""
     best = dict.fromkeys(calls, np.inf)
-    counts = {key: 10 if "many" in key else 100 for key in calls}
+    counts = {key: 10 if key in ("many", "shared", "every_many") else 100 for key in calls}
     for _ in range(REPEATS):
         for key, call in calls.items():
             start = time.process_time()

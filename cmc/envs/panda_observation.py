@@ -51,11 +51,11 @@ def measure(
     numbers: Array,
     flags: NDArray[np.bool_],
 ) -> None:
-    """Write observations (N, size), numbers (7, N) and flags (2, N), `passed` ticks later.
+    """Write observations (N, size), numbers (7, N) and flags (3, N), `passed` ticks later.
 
     Numbers: distance to the goal, m; tilt, rad; contact force, and the largest of the tick, N;
     deepest penetration, m; minus the distances to the sub-goal, m (or rad, of joints), and rad.
-    Flags: the time is up; success.
+    Flags: terminated (never), truncated (the time is up), success.
     """
     c, n = fixed[0], fixed[0].sliders
     for k in range(len(rows)):
@@ -76,5 +76,5 @@ def measure(
         numbers[0, k], numbers[1, k] = _length(away), _length(w.rotation)
         numbers[2, k], numbers[3, k], numbers[4, k] = _length(w.force), w.peaks[0], w.peaks[1]
         numbers[5, k], numbers[6, k] = -_length(missed), -_length(w.signals[3:6])
-        flags[0, k] = s.ticks >= c.ticks
-        flags[1, k] = numbers[0, k] < c.near and (np.abs(away) < c.box).all()
+        flags[0, k], flags[1, k] = False, s.ticks >= c.ticks
+        flags[2, k] = numbers[0, k] < c.near and (np.abs(away) < c.box).all()

@@ -202,7 +202,7 @@ class PandaTask:
         if action.shape != self._shape:
             raise ValueError(f"low-level action: wanted {self._shape}, got {action.shape}")
         self.worlds.tick(action)
-        obs, numbers, (ended, success) = self._observe(1)
+        obs, numbers, (terminated, truncated, success) = self._observe(1)
         distance, tilt, force, largest, deepest, missed, turned = numbers
         reward, terms = self._reward(distance, tilt)
         tracking = {"translation": missed, "rotation": turned}
@@ -214,14 +214,14 @@ class PandaTask:
             "penetration": deepest,
             "success": success,
         }
-        return obs, reward, np.zeros(self.num, dtype=bool), ended, info
+        return obs, reward, terminated, truncated, info
 
     # -- observations --------------------------------------------------------------------------
 
     def _observe(self, passed: int = 0) -> tuple[Array, Array, Mask]:
-        """Observations (N, size), numbers (7, N), time is up and success (2, N); see `measure`."""
+        """Observations (N, size), numbers (7, N) and flags (3, N); see `measure`."""
         obs, numbers = np.empty((self.num, self.observation_size)), np.empty((7, self.num))
-        flags = np.empty((2, self.num), dtype=bool)
+        flags = np.empty((3, self.num), dtype=bool)
         measure(self.worlds.rows, self._state, self._fixed, passed, obs, numbers, flags)
         return obs, numbers, flags
 

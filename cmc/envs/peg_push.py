@@ -45,7 +45,7 @@ class PegPush(PandaTask):
         return TARGET.copy()
 
     def _reward(self, distance: Array, tilt: Array) -> tuple[Array, dict[str, Array]]:
-        near, upright = -np.tanh(50.0 * distance), -0.1 * tilt
+        near, upright = np.tanh(-50.0 * distance), -0.1 * tilt
         return near + upright, {"translation": near, "rotation": upright}
 
 
