@@ -22,9 +22,9 @@ import torch
 from torch import nn
 
 from cmc.learning.td3 import TD3, Replay, TD3Config
-from cmc.studies import peg_maze, peg_push
-from cmc.studies.two_level import TwoLevelStudy
-from cmc.studies.two_level_parts import Planner, build
+from cmc.studies.old import peg_maze, peg_push
+from cmc.studies.old.two_level import TwoLevelStudy
+from cmc.studies.old.two_level_parts import Planner, build
 
 PAPER, SMALL = (400, 300), (128, 128)
 ROWS, BATCH, PERIOD = 65_536, 128, 2

@@ -83,15 +83,17 @@ def tidy(study: str, table: str = "tests") -> pd.DataFrame:
     if table not in TABLES:
         raise ValueError(f"table: wanted one of {', '.join(TABLES)}, got {table!r}")
     try:
-        return read(store.asset("results", _file(study, table)))
+        return read(store.asset("results", file_name(study, table)))
     except FileNotFoundError:
         there = {path.stem for path in store.asset("results").glob("*.csv")}
+        wanted = file_name(study, table)
         raise ValueError(
-            f"no results {_file(study, table)!r} are shipped; there are {', '.join(sorted(there))}"
+            f"no results {wanted!r} are shipped; there are {', '.join(sorted(there))}"
         ) from None
 
 
-def _file(study: str, table: str) -> str:
+def file_name(study: str, table: str) -> str:
+    """Name of a table's file."""
     return f"{study}.csv" if table == "tests" else f"{study}_{table}.csv"
 
 
@@ -112,13 +114,11 @@ def read(path: str | Path) -> pd.DataFrame:
     return data
 
 
-def write(
-    folder: str | Path, table: str, rows: Iterable[Mapping[str, Any]], record: Mapping[str, Any]
-) -> Path:
-    """Write rows as a table of `record["study"]`: CSV, six digits, below a line with the record."""
-    text = pd.DataFrame(list(rows)).to_csv(index=False, float_format="%.6g", lineterminator="\n")
+def write(folder: str | Path, table: str, data: pd.DataFrame, record: Mapping[str, Any]) -> Path:
+    """Write a table of `record["study"]`: CSV, six digits, below a line with the record."""
+    text = data.to_csv(index=False, float_format="%.6g", lineterminator="\n")
     head = json.dumps(dict(record), allow_nan=False)
-    path = Path(folder) / _file(record["study"], table)
+    path = Path(folder) / file_name(record["study"], table)
     return store.write_atomic(path, lambda file: file.write(f"# {head}\n{text}".encode()))
 
 

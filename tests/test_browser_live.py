@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cmc.studies import live, peg_maze, peg_push
+from cmc.studies import live, peg_maze, peg_push, runner
 from cmc.view.simulator import live_page, save_live_page
 
 STUDIES = {"peg_maze": peg_maze.STUDY, "peg_push": peg_push.STUDY}
@@ -41,8 +41,9 @@ def pages(browser, tmp_path_factory):
 
 @pytest.mark.parametrize(("name", "start"), [("peg_maze", 0), ("peg_maze", 1), ("peg_push", 1)])
 def test_an_episode_is_the_same_in_the_browser(pages, name, start):
-    page, study = pages[name], {"peg_maze": peg_maze, "peg_push": peg_push}[name]
-    here = study.motion("ctd3", 1, episode=start)["qpos"]
+    page, study = pages[name], STUDIES[name]
+    policy = runner.load(study, "ctd3", seed=1).policy
+    here = study.motion(study.config_of("ctd3"), policy, start)["qpos"][:-1]
     page.evaluate(
         "([start, ticks]) => { live.replayed = null;"
         " live.replay({method: 0, kept: 0, seed: 1}, start, ticks); }",

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from cmc.learning.hierarchy import HierarchyConfig, play
-from cmc.studies import peg_maze, peg_push
-from cmc.studies.two_level_parts import build
+from cmc.studies.old import peg_maze, peg_push
+from cmc.studies.old.two_level_parts import build
 
 
 def test_exploration_falls_linearly_and_stays():

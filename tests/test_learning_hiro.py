@@ -25,7 +25,7 @@ from cmc.learning.hiro import (
 from cmc.learning.low_level import Segment, evaluate
 from cmc.learning.td3 import TD3, Batch, TD3Config
 from cmc.robot.panda import FINGERTIP, forward_kinematics
-from cmc.studies import peg_maze
+from cmc.studies.old import peg_maze
 
 N, T = 2, 5
 FREE = (torch.full((N,), -9.0), torch.full((N,), 9.0))

@@ -9,7 +9,7 @@ import pytest
 
 from cmc.envs.peg_maze import PegMaze
 from cmc.learning.one_level import SegmentEnv
-from cmc.studies import peg_maze
+from cmc.studies.old import peg_maze
 
 STUDY = peg_maze.STUDY
 

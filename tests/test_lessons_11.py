@@ -11,7 +11,7 @@ from cmc.envs.peg_maze import GOAL_HIGH, GOAL_LOW
 from cmc.lessons import lesson_11, lesson_11_learning, lesson_11_relabel
 from cmc.lessons import lesson_11_results as shipped
 from cmc.lessons import lesson_11_verdicts as verdicts
-from cmc.studies import peg_maze
+from cmc.studies.old import peg_maze
 
 
 def test_a_target_at_the_goal_ends_at_the_wall():

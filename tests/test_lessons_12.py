@@ -6,7 +6,7 @@ import pytest
 from cmc import store
 from cmc.envs.peg_push import BOX_TOP, PUSH, TARGET
 from cmc.lessons import lesson_12, lesson_12_critic, lesson_12_episodes
-from cmc.studies import peg_push, two_level_training
+from cmc.studies.old import peg_push, two_level_training
 
 # -- one sub-goal, one plan ----------------------------------------------------------------------
 

@@ -141,7 +141,7 @@ def test_fixed_gains_are_beside_every_kept_policy() -> None:
 
 
 def test_what_is_written_is_read_again(tmp_path: object) -> None:
-    rows = [{"method": "a", "seed": 0, "x": 1 / 3, "last": True}]
+    rows = pd.DataFrame([{"method": "a", "seed": 0, "x": 1 / 3, "last": True}])
     path = results.write(str(tmp_path), "tests", rows, {"study": "s", "command": "c"})
     found = results.read(path)
     assert found.attrs == {"study": "s", "command": "c"}

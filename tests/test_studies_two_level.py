@@ -1,126 +1,89 @@
-"""Two-level training: exact resume after a kill, what is kept, and what is refused."""
+"""Studies of a planner over a low level: every method trains, is resumed, loaded and tested."""
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
-from scipy.stats import binom
+from small_studies import small
 
 from cmc import store
-from cmc.learning.hierarchy import HierarchyConfig
-from cmc.studies import (
-    peg_maze,
-    peg_push,
-    two_level,
-    two_level_evaluation,
-    two_level_results,
-)
-from cmc.studies.two_level_training import load, marks, train
+from cmc.__main__ import main
+from cmc.envs.peg_push import BOX_TOP, PUSH, PegPush
+from cmc.robot import panda
+from cmc.studies import peg_maze, peg_push, recorded, registry
+from cmc.studies.evaluation import evaluate
+from cmc.studies.peg_push import TIME_CONSTANT, scaled
+from cmc.studies.runner import load, marks_of, train
+from cmc.studies.study import Test
+from cmc.studies.two_level import TwoLevelConfig
+from cmc.studies.two_level_tests import Episodes, figures, judge, motion, slope_at_rest
 
-SMALL = HierarchyConfig(worlds=2, samples=80, high_updates=4, low_updates=4, warm_up=80)
-
-
-def small(study: two_level.TwoLevelStudy) -> two_level.TwoLevelStudy:
-    tiny = {"planner_hidden": (16,), "low_hidden": (8,), "snapshot_every": 120}
-    return replace(
-        study,
-        hierarchy=SMALL,
-        planner=replace(study.planner, critic_hidden=(16,), batch=16),
-        low=replace(study.low, critic_hidden=(16,), batch=16, critic_head_start=0),
-        task=replace(study.task, ticks=60),
-        joint_task=study.joint_task and replace(study.joint_task, ticks=60),
-        joint_hidden=(8,),
-        latent=replace(study.latent, batch=8),
-        ppo=replace(study.ppo, critic_hidden=(8,), epochs=2, minibatches=2),
-        **tiny,
-    )
+MAZE, PUSHING = small(peg_maze.STUDY), small(peg_push.STUDY)
+EVERY = [(MAZE, name) for name in MAZE.methods]
+SOME = [(PUSHING, name) for name in ("ctd3", "td3_corrected", "ppo_control")]
+LEARNS = ("ctd3", "td3", "hiro")
+ADAPTED = ("ctd3_short", "ctd3_plain_view", "ctd3_no_bursts", "ctd3_no_pull", "ctd3_tuned")
 
 
 def weights(path: Path) -> dict[str, np.ndarray]:
     return store.load_checkpoint(path)[0]
 
 
-EVERY = [(peg_maze.STUDY, name) for name in peg_maze.STUDY.methods]
-SOME = [(peg_push.STUDY, name) for name in ("ctd3", "td3_corrected", "ppo_control")]
+def same_weights(one: Path, other: Path) -> None:
+    expected, found = weights(other), weights(one)
+    assert expected.keys() == found.keys()
+    for key, value in found.items():
+        np.testing.assert_array_equal(value, expected[key], err_msg=key)
 
 
 @pytest.mark.parametrize(("study", "name"), EVERY + SOME, ids=lambda x: getattr(x, "name", x))
-def test_every_method_trains_and_loads(study, name: str, tmp_path: Path) -> None:
-    study = small(study)
-    path = train(study, name, [0, 3], steps=240, out=tmp_path)
-    assert marks(study, name, path) == [120, 240]
-    planner, low, record = load(study, name, path=path)
-    assert record["seeds"] == [0, 3]
-    found = two_level_evaluation.run_episodes(study.of(name), planner, low, seeds=2, episodes=2)
-    figures = two_level_evaluation.summary(found)
-    assert np.isfinite(figures["return"]).all()
-    assert figures["force"]["largest"]["below_5_N"] <= 1.0
+def test_every_method_trains_loads_and_is_tested(study, name: str, tmp_path: Path) -> None:
+    path = train(study, name, [0, 3], length=240, out=tmp_path)
     trained = weights(path)
+    assert marks_of(trained) == [120, 240]
     moved = [
         not np.array_equal(trained[key], trained[key.replace("00000240", "00000120")])
         for key in trained
         if key.startswith("00000240.low.")
     ]
-    learns = study.method(name).low in ("latent", "critic", "hiro")
-    assert any(moved) == learns
+    assert any(moved) == name.startswith(LEARNS)
+    if name in ADAPTED:
+        return  # the same networks as `ctd3`
+    found = load(study, name, path=path)
+    assert found.seeds == [0, 3]
+    tables = judge(study.config_of(name), found.policy, 2, Test("nominal", 2))
+    for row in tables["tests"]:
+        assert np.isfinite([v for v in row.values() if v is not None]).all()
+        assert row["no_contact"] <= row["below_1_N"] <= row["below_5_N"] <= 1.0
+        assert row["below_1_N"] <= row["below_1_N_50hz"]  # a tick's largest is at least its last
+        for axis in ("x", "rz"):
+            assert row.get(f"slope_{axis}", 0.0) <= row.get(f"cap_{axis}", np.inf) * (1 + 1e-3)
+    assert ("cap_x" in row) == (name in ("ctd3", "ctd3_tuned", "frozen", "frozen_tuned"))
+    assert len(tables["episodes"]) == 4
 
 
-def test_a_run_that_was_stopped_ends_with_the_same_weights(tmp_path: Path) -> None:
-    study = small(peg_maze.STUDY)
-    for name in ("ctd3", "td3_corrected", "hiro", "ppo_control"):
-        whole = train(study, name, [1, 2], steps=360, out=tmp_path / "whole")
-        train(study, name, [1, 2], steps=240, out=tmp_path / "parts")
-        parts = train(study, name, [1, 2], steps=360, out=tmp_path / "parts")
-        expected = weights(whole)
-        for key, value in weights(parts).items():
-            np.testing.assert_array_equal(value, expected[key], err_msg=f"{name} {key}")
-
-
-@pytest.mark.parametrize("study", [peg_maze.STUDY, peg_push.STUDY], ids=lambda s: s.name)
-@pytest.mark.parametrize("how", ["in the callback", signal.SIGINT, signal.SIGTERM])
-def test_an_interrupted_run_is_saved_within_an_episode(study, how, tmp_path: Path) -> None:
-    study, steps = small(study), 360
-    whole = train(study, "ctd3", [1, 2], steps=steps, out=tmp_path / "whole")
-
-    def stop(row: dict[str, Any]) -> None:
-        if row["steps"] == 160:  # the second of three segments
-            if isinstance(how, str):
-                raise KeyboardInterrupt
-            os.kill(os.getpid(), how)
-
-    with pytest.raises(KeyboardInterrupt):
-        train(study, "ctd3", [1, 2], steps=steps, out=tmp_path / "parts", callback=stop)
-    rows: list[int] = []
-    parts = train(
-        study,
-        "ctd3",
-        [1, 2],
-        steps=steps,
-        out=tmp_path / "parts",
-        callback=lambda row: rows.append(row["steps"]),
-    )
-    assert rows[0] == 200
-    expected = weights(whole)
-    for key, value in weights(parts).items():
-        np.testing.assert_array_equal(value, expected[key], err_msg=key)
+@pytest.mark.parametrize("name", ["ctd3", "td3_corrected", "hiro", "ppo_control"])
+def test_a_run_in_parts_ends_with_the_same_weights(name: str, tmp_path: Path) -> None:
+    whole = train(MAZE, name, [1, 2], length=360, out=tmp_path / "whole")
+    train(MAZE, name, [1, 2], length=240, out=tmp_path / "parts")
+    same_weights(train(MAZE, name, [1, 2], length=360, out=tmp_path / "parts"), whole)
 
 
 def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
     program = (
         "import sys; sys.path.insert(0, 'tests')\n"
         "from test_studies_two_level import *\n"
-        "import cmc.studies.two_level_training as training\n"
-        "training.SAVE_EVERY = 0.0\n"
-        f"train(small(peg_maze.STUDY), 'ctd3', [0], steps=720, out={str(tmp_path / 'killed')!r})"
+        "from cmc.studies import runner\n"
+        "runner.SAVE_EVERY = 0.0\n"
+        f"train(MAZE, 'ctd3', [0], length=720, out={str(tmp_path / 'killed')!r})"
     )
     root = Path(__file__).resolve().parent.parent
     process = subprocess.Popen([sys.executable, "-c", program], cwd=root)
@@ -130,96 +93,185 @@ def test_a_killed_run_goes_on_to_the_same_weights(tmp_path: Path) -> None:
     time.sleep(float(np.random.default_rng().uniform(0.0, 0.4)))
     process.send_signal(signal.SIGKILL)
     process.wait()
-    study = small(peg_maze.STUDY)
-    resumed = train(study, "ctd3", [0], steps=720, out=tmp_path / "killed")
-    whole = train(study, "ctd3", [0], steps=720, out=tmp_path / "whole")
-    expected = weights(whole)
-    for key, value in weights(resumed).items():
-        np.testing.assert_array_equal(value, expected[key], err_msg=key)
+    resumed = train(MAZE, "ctd3", [0], length=720, out=tmp_path / "killed")
+    same_weights(resumed, train(MAZE, "ctd3", [0], length=720, out=tmp_path / "whole"))
+
+
+def test_one_seed_of_a_run_acts_as_it_does_among_others(tmp_path: Path) -> None:
+    path = train(PUSHING, "ctd3", [0, 3], length=120, out=tmp_path)
+    observation = np.random.default_rng(0).normal(size=(2, 5, 25))
+    _, both = load(PUSHING, "ctd3", path=path).policy
+    for seed in range(2):
+        _, alone = load(PUSHING, "ctd3", seed=seed, path=path).policy
+        own = alone.act(observation[seed : seed + 1], explore=False)
+        np.testing.assert_allclose(own[0], both.act(observation, explore=False)[seed], atol=1e-6)
 
 
 def test_bad_requests_are_named(tmp_path: Path) -> None:
-    study = small(peg_maze.STUDY)
-    with pytest.raises(ValueError, match="unknown method 'sac'"):
-        train(study, "sac", [0], out=tmp_path)
     with pytest.raises(ValueError, match="unknown method 'hiro'"):
-        train(small(peg_push.STUDY), "hiro", [0], out=tmp_path)
-    with pytest.raises(ValueError, match="at least one, got none"):
-        train(study, "frozen", [], out=tmp_path)
+        train(PUSHING, "hiro", [0], out=tmp_path)
+    few = MAZE.variant("peg_maze", "", ppo=replace(MAZE.config.ppo, minibatches=9))
     with pytest.raises(ValueError, match="two segments for each of 9 minibatches, got 6"):
-        train(replace(study, ppo=replace(study.ppo, minibatches=9)), "ppo_control", [0])
-    path = train(study, "frozen", [0], steps=120, out=tmp_path)
+        train(few, "ppo_control", [0], out=tmp_path)
+    path = train(MAZE, "frozen", [0], length=120, out=tmp_path)
     with pytest.raises(store.CheckpointError, match="study 'peg_push'"):
-        load(small(peg_push.STUDY), "frozen", path=path)
-    with pytest.raises(store.CheckpointError, match="do not fit"):
-        load(replace(study, planner_hidden=(24,)), "frozen", path=path)
-    with pytest.raises(store.CheckpointError, match="configuration"):
-        train(replace(study, cap=1.0), "frozen", [0], steps=240, out=tmp_path)
-    with pytest.raises(ValueError, match="wanted one of \\[120\\]"):
-        load(study, "frozen", 90, path=path)
+        load(PUSHING, "frozen", path=path)
+    with pytest.raises(store.CheckpointError, match="shape of net"):
+        load(MAZE.variant("peg_maze", "", planner_hidden=(24,)), "frozen", path=path)
 
 
-def test_a_full_disk_keeps_the_earlier_checkpoint(tmp_path: Path, monkeypatch) -> None:
-    study = small(peg_maze.STUDY)
-    path = train(study, "frozen", [0], steps=120, out=tmp_path)
-    before = path.read_bytes()
-
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(store.os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"):
-        train(study, "frozen", [0], steps=240, out=tmp_path)
-    assert path.read_bytes() == before
-    monkeypatch.undo()
-    train(study, "frozen", [0], steps=240, out=tmp_path)
-
-
-def test_constrained_slopes_stay_below_the_cap_while_learning(tmp_path: Path) -> None:
-    study = small(peg_push.STUDY)
-    path = train(study, "ctd3", [0, 1], steps=480, out=tmp_path)
-    _, low, _ = load(study, "ctd3", path=path)
-    slopes = two_level_evaluation.slope_at_rest(study, low, seeds=2)
-    assert (slopes > 0).all()
-    assert (slopes <= study.slope_cap() * (1 + 1e-4)).all()
+def test_methods_change_what_their_title_says() -> None:
+    push, plain = peg_push.STUDY, peg_push.STUDY.config
+    assert plain.start_gain == push.config_of("frozen").start_gain == 0.3
+    assert push.config_of("gain").start_gain == push.config_of("ctd3_tuned").start_gain == 20.0
+    assert push.config_of("ctd3_short").planner.discount == 0.5 < plain.planner.discount
+    assert not push.config_of("ctd3_plain_view").relative
+    assert push.config_of("ctd3").slope_cap()[0] < push.config_of("frozen").slope_cap()[0]
+    hiro = peg_maze.STUDY.config_of("hiro_matched")
+    assert (hiro.task.command, hiro.hierarchy.high_noise, hiro.joint_noise) == ("joint", 0.3, 0.1)
+    assert hiro.hierarchy.high_noise_end is None
+    sizes = registry.get("peg_maze_paper_sizes").config
+    assert (sizes.planner_hidden, sizes.low_hidden) == ((400, 300), (200, 200))
+    assert registry.get("peg_maze_stiff").config.task.peg.stiffness == 0.0
 
 
-@pytest.mark.parametrize("name", ["control", "hiro"])
-def test_figures_by_kept_policy_go_on_where_they_stopped(name: str, tmp_path: Path) -> None:
-    study = small(peg_maze.STUDY)
-    train(study, name, [0, 1], steps=240, out=tmp_path)
-    seen: list[str] = []
-
-    def stop(done: int, total: int, what: str) -> None:
-        seen.append(what)
-        if done == 1 and len(seen) == 2:
-            raise KeyboardInterrupt
-
-    options = {"trajectories": 10, "folder": tmp_path / "tests", "checkpoints": tmp_path}
-    with pytest.raises(KeyboardInterrupt):
-        two_level_results.evaluate(study, [name], progress=stop, **options)
-    kept = store.read_json(tmp_path / "tests" / f"{name}.json")["tests"]
-    answer = two_level_results.evaluate(study, **options)
-    assert list(answer["methods"]) == [name]
-    found = answer["methods"][name]
-    assert [test["episodes"] for test in found["tests"]] == [2, 10]
-    assert found["tests"][:1] == kept
-    assert "gains" not in found["final"]
-    assert len(found["training"]["step"]) == len(found["training"]["reward"])
-    mean = np.mean([test["force"]["largest"]["zero"] for test in found["tests"]])
-    assert found["force_over_tests"]["largest"]["zero"] == pytest.approx(mean)
-    part = np.array(found["final"]["consistency_mm"]["mean"]) / 5.0
-    if name == "control":  # without action the gains alone decide, whatever was learned
-        assert part[0] == pytest.approx(part[1], rel=0.02)
-        assert 0.2 < part[0] < 0.8
-    assert np.isfinite(part).all()
+# -- contact of changed stiffness --------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("hits", "tries"), [(0, 10), (3, 10), (10, 10), (490, 500)])
-def test_the_ends_of_an_interval_leave_a_fortieth_on_each_side(hits: int, tries: int) -> None:
-    low, high = two_level_evaluation.interval(hits, tries)
-    assert 0.0 <= low <= hits / tries <= high <= 1.0
-    if hits:
-        assert binom.sf(hits - 1, tries, low) == pytest.approx(0.025)
-    if hits < tries:
-        assert binom.cdf(hits, tries, high) == pytest.approx(0.025)
+@pytest.mark.parametrize("scale", [0.4, 1.0, 4.0])
+def test_only_the_time_constant_of_what_touches_changes(scale: float) -> None:
+    nominal, changed = (kind(PUSH, 1).worlds.model for kind in (PegPush, scaled(scale)))
+    for name in ("peg", "lid", "obstacle", "base", "side_left", "stop"):
+        np.testing.assert_array_equal(nominal.geom(name).solref, [TIME_CONSTANT, 1.0])
+        np.testing.assert_allclose(changed.geom(name).solref, [scale * TIME_CONSTANT, 1.0])
+    changed.geom_solref[:] = nominal.geom_solref
+    buffers = [np.zeros(mujoco.mj_sizeModel(model), np.uint8) for model in (nominal, changed)]
+    for model, buffer in zip((nominal, changed), buffers, strict=True):
+        mujoco.mj_saveModel(model, None, buffer)
+    np.testing.assert_array_equal(*buffers)
+
+
+def _engine_constants(task: PegPush) -> np.ndarray:
+    """Stiffness and damping that MuJoCo uses when the peg is 0.05 mm inside the box's top."""
+    model = task.worlds.model
+    data, tip = mujoco.MjData(model), BOX_TOP + [0.012, 0.0135, -5e-5]
+    data.qpos[:7] = panda.inverse_kinematics(tip, tool=panda.FINGERTIP + PUSH.peg.length)
+    mujoco.mj_forward(model, data)
+    touching = data.efc_type == mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL
+    assert touching.any()
+    return data.efc_KBIP[touching][0, :2]
+
+
+@pytest.mark.parametrize("scale", [0.4, 2.0])
+def test_the_engine_uses_the_stiffness_and_damping_that_are_stated(scale: float) -> None:
+    nominal, changed = (_engine_constants(kind(PUSH, 1)) for kind in (PegPush, scaled(scale)))
+    np.testing.assert_allclose(changed / nominal, [scale**-2, 1 / scale], rtol=1e-9)
+
+
+@pytest.mark.parametrize("scale", [0.39, 0.0, -1.0, np.nan])
+def test_a_time_constant_that_the_engine_would_raise_is_refused(scale: float) -> None:
+    with pytest.raises(ValueError, match="two physics steps, 4 ms"):
+        scaled(scale)
+
+
+# -- figures -----------------------------------------------------------------------------------
+
+
+def test_an_episode_that_touches_and_leaves_has_passed_by() -> None:
+    success = np.array([[True, False, False, False]])
+    touched = np.array([[True, True, True, False]])
+    distance = np.array([[0.0001, 0.0104, 0.0312344, 0.02]])
+    nearest = np.minimum(distance, [[1.0, 0.0002, 0.0003, 0.015]])
+    force = np.array([[[0.0, 0.5, 3.0, 7.0]]])
+    found = Episodes(success, touched, distance, nearest, distance, force, 2 * force, distance)
+    (row,) = figures(found)
+    assert row["passed_by"] == 0.5
+    assert (row["final_mm"], row["nearest_mm"]) == pytest.approx((15.2, 0.25))
+    assert (row["no_contact"], row["below_1_N"], row["below_5_N"]) == (0.25, 0.25, 0.5)
+    assert (row["below_1_N_50hz"], row["largest_N_50hz"], row["largest_N"]) == (0.5, 7.0, 14.0)
+
+
+def test_slopes_are_zero_without_a_low_level_and_refused_in_joint_space() -> None:
+    config: TwoLevelConfig = PUSHING.config
+    control = PUSHING.build("control", [0, 1]).acting()[1]
+    assert not slope_at_rest(config, control, 2).any()
+    gain = PUSHING.build("gain", [0]).acting()[1]
+    np.testing.assert_allclose(
+        slope_at_rest(config, gain, 1)[0], np.minimum(20.0, 0.99 * config.slope_cap()), rtol=1e-3
+    )
+    with pytest.raises(ValueError, match="wanted a low level of the tip"):
+        slope_at_rest(MAZE.config_of("hiro"), gain, 1)
+
+
+# -- recordings --------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("runs")
+    request = ["train", "peg_push", "--method", "frozen", "--seeds", "2", "--out", str(folder)]
+    assert main([*request, "--steps", "160"]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def episode(run: Path) -> Path:
+    path = run / "episode.npz"
+    request = ["play", "peg_push", "--method", "frozen", "--seed", "1", "--episode", "3"]
+    checkpoint = str(run / "peg_push_frozen.safetensors")
+    assert main([*request, "--checkpoint", checkpoint, "--out", str(path)]) == 0
+    return path
+
+
+def test_a_recording_is_the_motion_it_was_made_of(run: Path, episode: Path) -> None:
+    path = run / "peg_push_frozen.safetensors"
+    policy = load(peg_push.STUDY, "frozen", seed=1, path=path).policy
+    wanted = motion(peg_push.STUDY.config_of("frozen"), policy, 3)
+    found = recorded.load(episode)
+    for name in ("t", "qpos", "tip", "force", "distance"):
+        np.testing.assert_array_equal(found[name], wanted[name])
+    for name, value in wanted["markers"].items():
+        np.testing.assert_array_equal(found["markers"][name], value)
+    assert found["text"].endswith(wanted["text"])
+    assert found["success"] <= found["touched"]
+    assert found["record"]["seeds"] == [1]
+    data = mujoco.MjData(found["model"])
+    for k in (0, 500, 999):  # the tip is where the joints put it
+        data.qpos[:] = found["qpos"][k]
+        mujoco.mj_kinematics(found["model"], data)
+        np.testing.assert_allclose(data.site("tip").xpos, found["tip"][k], atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["truncated", "foreign", "text", "scene"])
+def test_bad_recordings_are_refused(kind: str, episode: Path, tmp_path: Path) -> None:
+    path = tmp_path / "bad.npz"
+    if kind == "truncated":
+        path.write_bytes(episode.read_bytes()[:-200])
+    elif kind == "foreign":
+        np.savez(path, a=np.zeros(3))
+    elif kind == "text":
+        path.write_text("hello")
+    else:
+        with np.load(episode) as found:
+            arrays = dict(found)
+        np.savez(path, **{**arrays, "qpos": arrays["qpos"][:, :-1]})
+    with pytest.raises(store.CheckpointError, match=r"bad\.npz"):
+        recorded.load(path)
+
+
+def test_unknown_episodes_are_named(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="episodes/none"):
+        recorded.load("none")
+    with pytest.raises(ValueError, match="lacks"):
+        recorded.save(tmp_path / "x.npz", {}, {"study": "peg_push"})
+
+
+def test_tests_under_other_contact_are_made_under_it(run: Path, tmp_path: Path) -> None:
+    tests = tuple(replace(test, methods=None) for test in peg_push.STUDY.tests[1:3])
+    study = replace(peg_push.STUDY, tests=tests)
+    options = {"checkpoints": run, "folder": tmp_path, "trajectories": 1}
+    rows = evaluate(study, ["frozen"], **options)["tests"]
+    assert [row["test"] for row in rows] == ["nominal"] * 2 + ["contact x 0.4"] * 2
+    assert "moved_mm" in rows[0]
+    assert "moved_mm" not in rows[2]
+    assert tests[1].change(study.config).task_class is scaled(0.4)

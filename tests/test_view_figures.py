@@ -141,10 +141,10 @@ def test_a_method_has_one_color_and_line_wherever_it_is_drawn():
 
 
 def test_titles_are_those_of_the_studies():
-    from cmc.studies import peg_maze, peg_push
-    from cmc.studies.peg_touch_methods import METHODS
+    from cmc.studies import registry
 
-    for methods in (METHODS, peg_maze.STUDY.methods, peg_push.STUDY.methods):
+    for study in ("peg_touch", "peg_maze", "peg_push"):
+        methods = registry.get(study).methods
         assert {n: m.title for n, m in methods.items()}.items() <= figures.METHOD_TITLES.items()
 
 

@@ -15,9 +15,9 @@ from cmc.learning.latent import LatentLow
 from cmc.learning.low_level import Fixed, LowLevel, latent_policy
 from cmc.policies import LinearNetwork
 from cmc.robot.panda import load_scene
-from cmc.studies import peg_maze, peg_maze_stiff
-from cmc.studies.two_level_parts import build_low
-from cmc.studies.two_level_training import marks
+from cmc.studies.old import peg_maze, peg_maze_stiff
+from cmc.studies.old.two_level_parts import build_low
+from cmc.studies.old.two_level_training import marks
 
 Array = NDArray[np.float64]
 STUDIES = {"soft": peg_maze.STUDY, "stiff": peg_maze_stiff.STUDY}

@@ -15,8 +15,8 @@ from cmc.learning.low_level import Fixed, Segment, evaluate, set_gain
 from cmc.learning.state import single_thread
 from cmc.lessons.lesson_11 import MM, STUDIES
 from cmc.policies import ModularPolicy, PositiveNetwork
-from cmc.studies.two_level import TwoLevelStudy
-from cmc.studies.two_level_parts import build, build_low
+from cmc.studies.old.two_level import TwoLevelStudy
+from cmc.studies.old.two_level_parts import build, build_low
 
 Array = NDArray[np.float64]
 Show = Callable[..., object]

@@ -21,8 +21,8 @@ from cmc.learning.hiro import (
     subgoal_transition,
 )
 from cmc.learning.td3 import Batch
-from cmc.studies import peg_maze
-from cmc.studies.two_level_parts import build_low
+from cmc.studies.old import peg_maze
+from cmc.studies.old.two_level_parts import build_low
 
 Array = NDArray[np.float64]
 STUDY = peg_maze.STUDY.of("hiro")

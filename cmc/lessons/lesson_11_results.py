@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cmc import store
-from cmc.studies.peg_maze import STUDY
+from cmc.studies.old.peg_maze import STUDY
 
 Array = NDArray[np.float64]
 Method = dict[str, Any]

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from cmc.envs.peg_push import BOX_TOP, PUSH, PegPush
 from cmc.fast import budget
 from cmc.learning.state import single_thread
-from cmc.studies import peg_push
-from cmc.studies.two_level_parts import build
+from cmc.studies.old import peg_push
+from cmc.studies.old.two_level_parts import build
 
 Array = NDArray[np.float64]
 Show = Callable[[int, float, float], object]

@@ -19,9 +19,9 @@ from cmc.learning.latent import LatentModel
 from cmc.learning.low_level import CriticLow, LowLevel, Segment
 from cmc.learning.state import single_thread
 from cmc.lessons.lesson_12 import LATENT, low_level
-from cmc.studies import peg_push
-from cmc.studies.two_level_evaluation import slope_at_rest
-from cmc.studies.two_level_parts import build_low
+from cmc.studies.old import peg_push
+from cmc.studies.old.two_level_evaluation import slope_at_rest
+from cmc.studies.old.two_level_parts import build_low
 
 Array = NDArray[np.float64]
 Act = Callable[[Array], Array]

@@ -14,9 +14,9 @@ from cmc.fast import budget
 from cmc.learning.hierarchy import low_fields
 from cmc.learning.low_level import evaluate
 from cmc.learning.state import single_thread
-from cmc.studies import peg_push
-from cmc.studies.two_level_evaluation import TEST_SEED, slope_at_rest
-from cmc.studies.two_level_training import marks
+from cmc.studies.old import peg_push
+from cmc.studies.old.two_level_evaluation import TEST_SEED, slope_at_rest
+from cmc.studies.old.two_level_training import marks
 
 Array = NDArray[np.float64]
 STUDY = peg_push.STUDY

@@ -8,21 +8,23 @@ from typing import Any
 import numpy as np
 from torch import Tensor, nn
 
+from cmc import store
 from cmc.robot.panda import scene_spec
-from cmc.studies.two_level import TwoLevelStudy, start_joints
-from cmc.studies.two_level_evaluation import TEST_SEED
-from cmc.studies.two_level_training import load, marks
+from cmc.studies.runner import find, load, marks_of
+from cmc.studies.study import Study
+from cmc.studies.two_level import start_joints
+from cmc.studies.two_level_tests import TEST_SEED
 
 
-def live_task(study: TwoLevelStudy, starts: int = 5) -> dict[str, Any]:
+def live_task(study: Study, starts: int = 5) -> dict[str, Any]:
     """Scene, control law, limits and test starts of a study's task; SI units throughout."""
-    c, latent = study.task, study.task.gains.latent
+    c, latent = study.config.task, study.config.task.gains.latent
     spec = scene_spec(c.scene, c.peg, c.timestep)
     spec.compile()
-    task = study.task_class(c, num=starts)
+    task = study.config.make(starts)
     task.seed([TEST_SEED + k for k in range(starts)])
     obs = task.reset()
-    goals, planning = obs[:, task.layout["goal"]], study.planning()
+    goals, planning = obs[:, task.layout["goal"]], study.config.planning()
     sizes = {name: part.stop - part.start for name, part in task.layout.items()}
 
     def row(table: Any, name: str, default: float) -> list[float]:
@@ -60,7 +62,7 @@ def live_task(study: TwoLevelStudy, starts: int = 5) -> dict[str, Any]:
 
 
 def live_policies(
-    study: TwoLevelStudy, methods: Sequence[str], steps: Sequence[int] | None = None
+    study: Study, methods: Sequence[str], steps: Sequence[int] | None = None
 ) -> list[dict[str, Any]]:
     """Planner and low level of every method, kept policy and seed, as nested lists of arrays.
 
@@ -72,17 +74,16 @@ def live_policies(
     found = []
     for name in methods:
         kept = []
-        for step in [m for m in marks(study, name) if steps is None or m in steps][-3:]:
-            planner, low, record = load(study, name, step)
-            seeds = record["seeds"]
+        marks = marks_of(store.load_checkpoint(find(study, name))[0])
+        for step in marks[-1:] if steps is None else [m for m in marks if m in steps][-3:]:
+            loaded = load(study, name, step)
+            planner, low = loaded.policy
             actor = getattr(low, "actor", None)
             policies = [
-                {"planner": _layers(planner.net, k, 1)[0], "low": _low(actor, k)}
-                for k in range(len(seeds))
+                {"planner": _layers(planner.network.mlp, k, 1)[0], "low": _low(actor, k)}
+                for k in range(len(loaded.seeds))
             ]
-            kept.append({"step": step, "seeds": list(seeds), "policies": policies})
-        if steps is None:
-            kept = kept[-1:]
+            kept.append({"step": step, "seeds": loaded.seeds, "policies": policies})
         found.append({"name": name, "title": study.method(name).title, "kept": kept})
     return found
 
@@ -90,9 +91,9 @@ def live_policies(
 def _low(actor: nn.Module | None, seed: int) -> dict[str, Any]:
     if actor is None:
         return {"kind": "none"}
-    net: Any = actor.net
-    if not hasattr(net, "mlp"):
-        return {"kind": "gain", "gain": net.gain.detach().numpy()}
+    net: Any = actor.network
+    if not hasattr(net, "mlp"):  # the same gain for y and its integral
+        return {"kind": "gain", "gain": net.gains[:, 0].numpy()}
     weights = net.positive_weights() if hasattr(net, "positive_weights") else None
     return {"kind": "networks", "networks": _layers(net.mlp, seed, net.n, weights)}
 

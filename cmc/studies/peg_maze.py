@@ -9,8 +9,8 @@ What the paper gives is in `cmc.envs.peg_maze` and in the table `tab:my_label`. 
 4. The planner's rates are 1e-3 and its targets move by .01 at every update; its noise falls from
    0.3 to 0.1 half-ranges in 60,000 steps; 10,000 steps of random sub-goals come first, from which
    the low level alone learns; rewards are means over a segment, in cm. Its critics also see tip and
-   sub-goal relative to the goal (`cmc.learning.critic_view`), and a small weight on the actor's
-   values before its last tanh keeps them where it has a slope. The discount is the paper's.
+   sub-goal relative to the goal (`cmc.learning.planning.CriticView`), and a small weight on the
+   actor's values before its last tanh keeps them where it has a slope. The discount is the paper's.
 5. Critics have 128, 128 units.
 6. Low level: a segment ends its return, in every method, and every network starts with a slope of
    0.3 at rest ("tuned start": 20). The paper's scheme has biases, no cap, a critic that sees
@@ -31,55 +31,70 @@ What the paper gives is in `cmc.envs.peg_maze` and in the table `tab:my_label`. 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 from cmc.envs.peg_maze import JOINT, SOFT, STIFF, PegMaze
 from cmc.learning.hierarchy import HierarchyConfig
 from cmc.learning.latent import LatentConfig
 from cmc.learning.td3 import TD3Config
-from cmc.studies import two_level_motion, two_level_results, two_level_training
-from cmc.studies.two_level import TwoLevelStudy
+from cmc.studies.study import Study, Test, before_last, last
+from cmc.studies.two_level import TwoLevelConfig, light
+from cmc.studies.two_level_arms import HIRO, METHODS
+from cmc.studies.two_level_tests import judge, motion
 
 _CENTER = (0.415, -0.0225, 0.005)
 _INVERSE_HALF = (1 / 0.015, 1 / 0.0075, 1 / 0.01)
 
-STUDY = TwoLevelStudy(
+TESTS = (Test("nominal", 20, when=before_last), Test("nominal", 100, when=last))
+"""Policies kept on the way are tested by fewer episodes."""
+
+STUDY = Study(
     name="peg_maze",
-    task=SOFT,
-    task_class=PegMaze,
-    shift={"position": _CENTER, "goal": _CENTER},
-    scale={
-        "position": _INVERSE_HALF,
-        "goal": _INVERSE_HALF,
-        "velocity": (20.0, 20.0, 20.0, 1.0, 1.0, 1.0),
-    },
-    hierarchy=HierarchyConfig(reward_scale=100.0, high_noise_end=0.1, noise_steps=60_000),
-    planner=TD3Config(discount=0.5, actor_rate=1e-3, target_rate=0.01, target_period=1, pull=0.003),
-    relative=True,
-    low=TD3Config(
-        discount=1.0,
-        action_gradient_clip=0.1,
-        gradient_clip=0.1,
-        target_period=100,
-        critic_head_start=500,
+    about="a compliant peg finds its way between walls: a planner over C-TD3 and over its rivals",
+    config=TwoLevelConfig(
+        task=SOFT,
+        task_class=PegMaze,
+        shift={"position": _CENTER, "goal": _CENTER},
+        scale={
+            "position": _INVERSE_HALF,
+            "goal": _INVERSE_HALF,
+            "velocity": (20.0, 20.0, 20.0, 1.0, 1.0, 1.0),
+        },
+        hierarchy=HierarchyConfig(reward_scale=100.0, high_noise_end=0.1, noise_steps=60_000),
+        planner=TD3Config(
+            discount=0.5, actor_rate=1e-3, target_rate=0.01, target_period=1, pull=0.003
+        ),
+        relative=True,
+        low=TD3Config(
+            discount=1.0,
+            action_gradient_clip=0.1,
+            gradient_clip=0.1,
+            target_period=100,
+            critic_head_start=500,
+        ),
+        joint_task=JOINT,
+        joint_aim=(0.4125, -0.0225, 0.010),
     ),
-    steps=140_000,
-    snapshot_every=20_000,
-    joint_task=JOINT,
-    joint_aim=(0.4125, -0.0225, 0.010),
+    methods={**METHODS, **HIRO},
+    tests=TESTS,
+    length=140_000,
+    every=20_000,
+    judge=judge,
+    motion=motion,
+    light=light,
 )
-STIFF_STUDY = replace(
-    STUDY,
-    name="peg_maze_stiff",
+_STIFF = STUDY.variant(
+    "peg_maze_stiff",
+    "the maze with a rigid peg and actions of 1 m/s^2",
     task=STIFF,
     latent=LatentConfig(force_weight=0.5),  # pressing forces exceed the limit here
     start_gain=20.0,  # the shipped policies of this regime had it
     joint_task=None,
 )
-
-NAME = STUDY.name
-METHODS = STUDY.methods
-train = partial(two_level_training.train, STUDY)
-evaluate = partial(two_level_results.evaluate, STUDY)
-load = partial(two_level_training.load, STUDY)
-motion = partial(two_level_motion.motion, STUDY)
+_PAPER_SIZES = STUDY.variant(
+    "peg_maze_paper_sizes",
+    "the maze with the network sizes of the paper's table",
+    planner=replace(STUDY.config.planner, critic_hidden=(400, 300)),
+    planner_hidden=(400, 300),
+    low_hidden=(200, 200),
+)
+VARIANTS = {study.name: study for study in (replace(_STIFF, methods=METHODS), _PAPER_SIZES)}

@@ -15,61 +15,131 @@ What the paper gives is in `cmc.envs.peg_push` and in the table `tab:para`. Devi
    frees the target, which small noise does not find. 10,000 steps of random sub-goals come first;
    rewards are means over a segment.
 5. Its critics also see tip and sub-goal relative to the target in millimeters, at several scales
-   (`cmc.learning.critic_view`), and a small weight on the actor's values before its last tanh keeps
+   (`cmc.learning.planning`), and a small weight on the actor's values before its last tanh keeps
    them where it has a slope. Critics have 128, 128 units.
 6. Low level: as in the maze (`cmc.studies.peg_maze`, 6); PPO/Control as there (8), discount .9.
 7. 3 to 5 were chosen in trainings with seeds 0 to 4.
+
+The contact of the simulator is soft; how much of the result it owes to that is tested too. MuJoCo
+(its documentation, chapter Modeling, section "Solver parameters") resolves a contact of depth r by
+the reference acceleration a = -b v - k r with
+
+    b = 2 / (d_max T),    k = d(r) / (d_max^2 T^2 zeta^2),
+
+where solref = (T, zeta) are a time constant and a damping ratio, and solimp sets the impedance d.
+Appendix H has T = 10 ms and zeta = 1. Tests "contact x c" multiply T of every shape that can touch
+by c, while zeta, d and all else stay: k goes with 1 / c^2, b with 1 / c. Studies
+`peg_push_contact_xC` train under such contact.
 """
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import mujoco
+import numpy as np
 
 from cmc.envs.peg_push import PUSH, TARGET, PegPush
 from cmc.learning.hierarchy import HierarchyConfig
 from cmc.learning.ppo import PPOConfig
 from cmc.learning.td3 import TD3Config
-from cmc.studies import two_level_motion, two_level_results, two_level_training
-from cmc.studies.two_level import TwoLevelStudy
+from cmc.studies.peg_maze import TESTS
+from cmc.studies.study import Study, Test, last
+from cmc.studies.two_level import TwoLevelConfig, light
+from cmc.studies.two_level_arms import METHODS
+from cmc.studies.two_level_tests import judge, motion
 
-STUDY = TwoLevelStudy(
+TIME_CONSTANT = 0.01
+"""Of contact in the scene, s."""
+
+
+@cache
+def scaled(scale: float) -> type[PegPush]:
+    """Peg push with the time constant of all contact multiplied by `scale`.
+
+    Raises:
+        ValueError: if the time constant falls below two physics steps, the shortest that MuJoCo
+            accepts (it silently raises shorter ones).
+    """
+    shortest = 2 * PUSH.timestep
+    if not (np.isfinite(scale) and scale * TIME_CONSTANT >= shortest * (1 - 1e-9)):
+        raise ValueError(
+            f"scale: {scale} makes the time constant {1e3 * scale * TIME_CONSTANT:g} ms, wanted at "
+            f"least two physics steps, {1e3 * shortest:g} ms"
+        )
+
+    class Scaled(PegPush):
+        def _scene(self, history: int) -> mujoco.MjModel:
+            model = super()._scene(history)
+            touches = (model.geom_contype | model.geom_conaffinity) != 0
+            model.geom_solref[touches, 0] *= scale
+            return model
+
+    Scaled.__name__ = Scaled.__qualname__ = f"PegPush, contact x {scale:g}"
+    return Scaled
+
+
+def contact(scale: float) -> Callable[[TwoLevelConfig], TwoLevelConfig]:
+    """The task with the time constant of all contact multiplied."""
+    return lambda config: replace(config, task_class=scaled(scale))
+
+
+STUDY = Study(
     name="peg_push",
-    task=PUSH,
-    task_class=PegPush,
-    shift={"position": tuple(TARGET), "goal": tuple(TARGET)},
-    scale={
-        "position": 100.0,
-        "goal": 100.0,
-        "velocity": (20.0, 20.0, 20.0, 1.0, 1.0, 1.0),
-        "sliders": 100.0,
-        "slider_velocity": 10.0,
-    },
-    hierarchy=HierarchyConfig(
-        high_noise_end=0.05,
-        redraw=(0.1, 0.02),
-        burst=(0.05, 0.01),
-        noise_steps=180_000,
-        rate_steps=(180_000, 420_000),
+    about="the peg pushes an obstacle aside and touches a target: a planner, and the ablation",
+    config=TwoLevelConfig(
+        task=PUSH,
+        task_class=PegPush,
+        shift={"position": tuple(TARGET), "goal": tuple(TARGET)},
+        scale={
+            "position": 100.0,
+            "goal": 100.0,
+            "velocity": (20.0, 20.0, 20.0, 1.0, 1.0, 1.0),
+            "sliders": 100.0,
+            "slider_velocity": 10.0,
+        },
+        hierarchy=HierarchyConfig(
+            high_noise_end=0.05,
+            redraw=(0.1, 0.02),
+            burst=(0.05, 0.01),
+            noise_steps=180_000,
+            rate_steps=(180_000, 420_000),
+        ),
+        planner=TD3Config(
+            discount=0.9,
+            actor_rate=1e-3,
+            target_rate=0.01,
+            target_period=1,
+            target_noise=0.05,
+            target_noise_clip=0.125,
+            pull=0.003,
+        ),
+        ppo=PPOConfig(gamma=0.9, epochs=10, learning_rate=1e-3),
+        relative=True,
+        low=TD3Config(discount=1.0, action_gradient_clip=0.1, critic_head_start=500),
     ),
-    planner=TD3Config(
-        discount=0.9,
-        actor_rate=1e-3,
-        target_rate=0.01,
-        target_period=1,
-        target_noise=0.05,
-        target_noise_clip=0.125,
-        pull=0.003,
+    methods=METHODS,
+    tests=(
+        *TESTS,
+        *(
+            Test(f"contact x {scale:g}", 50, contact(scale), last, ("ctd3", "frozen", "td3"))
+            for scale in (0.4, 0.7, 2.0, 4.0)
+        ),
     ),
-    ppo=PPOConfig(gamma=0.9, epochs=10, learning_rate=1e-3),
-    relative=True,
-    low=TD3Config(discount=1.0, action_gradient_clip=0.1, critic_head_start=500),
-    steps=480_000,
-    snapshot_every=60_000,
+    length=480_000,
+    every=60_000,
+    judge=judge,
+    motion=motion,
+    light=light,
 )
 
-NAME = STUDY.name
-METHODS = STUDY.methods
-train = partial(two_level_training.train, STUDY)
-evaluate = partial(two_level_results.evaluate, STUDY)
-load = partial(two_level_training.load, STUDY)
-motion = partial(two_level_motion.motion, STUDY)
+
+def under(scale: float) -> Study:
+    """The study trained, and tested, under other contact."""
+    name, about = f"peg_push_contact_x{scale:g}", f"peg push learned under contact x {scale:g}"
+    return replace(STUDY.variant(name, about, task_class=scaled(scale)), tests=TESTS)
+
+
+VARIANTS = {study.name: study for study in (under(0.4), under(4.0))}

@@ -22,48 +22,245 @@ shape. What it leaves open is chosen here, and everything that differs from it i
 
 from __future__ import annotations
 
-from cmc.envs.peg_touch_config import PegShift, PegTouchConfig
-from cmc.studies.peg_touch_certificates import certificate_of
-from cmc.studies.peg_touch_claims import at, claims, select
-from cmc.studies.peg_touch_evaluation import SHIFTS, TestConfig, run_test, shifted
-from cmc.studies.peg_touch_methods import METHODS
-from cmc.studies.peg_touch_motion import motion, simulate
-from cmc.studies.peg_touch_results import evaluate, results
-from cmc.studies.peg_touch_training import (
-    NAME,
-    PegTouchStudy,
-    build,
-    contents,
-    learning_curve,
-    load,
-    slope_limit,
-    task_of,
-    train,
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from torch import nn
+
+from cmc import store
+from cmc.envs.peg_touch_config import PegTouchConfig
+from cmc.studies import peg_touch_tests, runner
+from cmc.studies.peg_touch_arms import (
+    Network,
+    TouchConfig,
+    TouchTraining,
+    bounded,
+    bypass,
+    capped,
+    convex,
+    cppo,
+    fixed,
+    joint,
+    no_integral,
+    ppo,
+    raw,
+)
+from cmc.studies.peg_touch_certificates import certificates
+from cmc.studies.peg_touch_tests import SHIFTS, measure, shifted, signed, simulate
+from cmc.studies.study import Method, Rows, Study, Test, last, same
+
+PAPER_EPISODE = 5000
+"""The episode whose policies the paper's generalization test uses (fig:1 c)."""
+
+# -- methods --------------------------------------------
+
+
+def arm(title: str, network: Network, adapt: Callable[[Any], Any] = same, **more: Any) -> Method:
+    """A method that trains a network by PPO."""
+    return Method(title, lambda c, seeds: TouchTraining(c, network(c, seeds), seeds), adapt, **more)
+
+
+def seeing(config: TouchConfig, interface: str) -> TouchConfig:
+    """The environment shows `auxiliary` signals, `identity` for T_y = I, or `raw` ones."""
+    return replace(config, task=replace(config.task, interface=interface))
+
+
+def scaled(config: TouchConfig) -> TouchConfig:
+    """The vertical action is multiplied by 16 N/m, the middle of the range, over the nominal K."""
+    return replace(config, task=replace(config.task, stiffness_reference=16.0))
+
+
+def stress(config: TouchConfig) -> TouchConfig:
+    """PPO set aggressively: large steps, more epochs, no floor under the noise."""
+    harsh = replace(config.ppo, learning_rate=3e-3, epochs=10, log_std_floor=-20.0)
+    return replace(config, ppo=harsh)
+
+
+METHODS: dict[str, Method] = {
+    "cppo": arm("C-PPO", cppo),
+    "ppo": arm("PPO, one network per dimension", ppo),
+    "cppo_capped": arm("C-PPO, capped", capped),
+    "cppo_bypass": arm("C-PPO, capped, vertical bypass", bypass),
+    "cppo_scaled": arm("C-PPO, capped loop gain", capped, scaled),
+    "ppo_stress": arm("PPO, stress setting", ppo, stress),
+    "cppo_stress": arm("C-PPO, stress setting", cppo, stress),
+    "ppo_joint": arm("PPO, joint network", joint),
+    "ppo_raw": arm("PPO, raw inputs", raw, partial(seeing, interface="raw")),
+    "cppo_identity": arm("C-PPO, T_y = T_a = I", cppo, partial(seeing, interface="identity")),
+    "cppo_bounded": arm("C-PPO, bounded on both sides", bounded),
+    "cppo_no_integral": arm("C-PPO, no integral", no_integral),
+    "convex_pi": arm("Convex-gradient PI", convex),
+    "pi": arm("Hand-tuned PI", fixed((2.0, 40.0), (0.02, 8.0)), trained=False),
+    "pi_scaled": arm(
+        "Hand-tuned PI, scheduled on stiffness",
+        fixed((2.0, 40.0), (0.012, 5.6)),
+        scaled,
+        trained=False,
+    ),
+}
+
+
+# -- tests --------------------------------------------
+
+
+def change(shift: str, h: float | None = None) -> Callable[[TouchConfig], TouchConfig]:
+    """The plant shifted, and another control period if given."""
+    return lambda config: replace(config, task=shifted(config.task, shift, h))
+
+
+def paper(marks: Sequence[int]) -> Sequence[int]:
+    """The kept policy of the paper's generalization test; in a shorter run the last one."""
+    return [PAPER_EPISODE] if PAPER_EPISODE in marks else marks[-1:]
+
+
+def sparse(marks: Sequence[int]) -> Sequence[int]:
+    """Kept policies at which every method is tested."""
+    return [m for m in marks if m in (1000, 5000, 10_000, 15_000) or m == marks[-1]]
+
+
+def paper_and_last(marks: Sequence[int]) -> Sequence[int]:
+    """Both, once."""
+    return sorted({*paper(marks), *last(marks)})
+
+
+_CAPPED = ("cppo_capped", "cppo_bypass")
+_MAIN = ("cppo", "ppo", "cppo_bounded", "pi", "pi_scaled")
+_TIMED = (*_CAPPED, "cppo", "ppo", "cppo_bounded")
+_CURVES = ("ppo_stress", "cppo_stress", "ppo_joint", "ppo_raw")
+_SIDE = tuple(name for name in METHODS if name not in _CAPPED + _MAIN)
+_MANY, _FEW = 8000, 2000
+SAMPLE_TIMES = (0.002, 0.005, 0.01, 0.02, 0.03)
+"""Control periods of the test of the sampled-data bound [s]; training has 0.01."""
+
+TESTS = (
+    Test("nominal", _MANY, methods=("cppo", "ppo", *_CAPPED)),
+    Test("nominal", _MANY, when=sparse, methods=_MAIN[2:]),
+    Test("nominal", _FEW, methods=_CURVES),
+    Test("nominal", _FEW, when=sparse, methods=tuple(m for m in _SIDE if m not in _CURVES)),
+    *(
+        Test(shift, number, change(shift), when, methods)
+        for shift in SHIFTS
+        if shift != "nominal"
+        for number, when, methods in (
+            (_MANY, same, _CAPPED),
+            (_MANY, paper_and_last, _MAIN),
+            (_FEW, paper, _SIDE),
+        )
+    ),
+    *(
+        Test("nominal", _FEW, change("nominal", h), paper, _TIMED)
+        for h in SAMPLE_TIMES
+        if h != PegTouchConfig().h
+    ),
 )
 
-__all__ = [
-    "METHODS",
-    "NAME",
-    "SHIFTS",
-    "PegShift",
-    "PegTouchConfig",
-    "PegTouchStudy",
-    "TestConfig",
-    "at",
-    "build",
-    "certificate_of",
-    "claims",
-    "contents",
-    "evaluate",
-    "learning_curve",
-    "load",
-    "motion",
-    "results",
-    "run_test",
-    "select",
-    "shifted",
-    "simulate",
-    "slope_limit",
-    "task_of",
-    "train",
-]
+
+def judge(config: TouchConfig, policy: nn.Module, seeds: int, test: Test) -> dict[str, Rows]:
+    """One test of one policy, and what its weights guarantee."""
+    sized = replace(config.test, trajectories=test.number)
+    found = measure(policy, config.task, sized, seeds)
+    if test.change is same and signed(policy):
+        found["certificates"] = certificates(policy, config.task, config.slope_limit())
+    return found
+
+
+def motion(config: TouchConfig, policy: nn.Module, episode: int) -> dict[str, Any]:
+    """Errors of 50 trajectories of the training set, from a random stream of this number."""
+    run = simulate(policy, config.task, seed=episode)
+    end_x, end_f = (np.median(np.abs(run[key][-1])) for key in ("e_x", "e_f"))
+    signals = [
+        (r"$x - x_d$ (m)", run["e_x"], 0.0),
+        (r"$f - f_d$ (N)", np.clip(run["e_f"], -10.0, 10.0), 0.0),
+    ]
+    text = f"50 trajectories end {end_x:.2g} m and {end_f:.2g} N from their targets (median)"
+    return {"t": run["t"], "signals": signals, "text": text}
+
+
+STUDY = Study(
+    name="peg_touch",
+    about="PPO against C-PPO: a peg on a lag presses on a surface of unknown stiffness",
+    config=TouchConfig(),
+    methods=METHODS,
+    tests=TESTS,
+    length=15_000,
+    every=1000,
+    judge=judge,
+    motion=motion,
+    shown=paper,
+    unit="episode",
+    gain="return",
+)
+
+
+def at_period(h: float) -> Study:
+    """The study with another control period [s]: episodes and discounts keep their duration."""
+    share = h / STUDY.config.task.h
+    task = replace(STUDY.config.task, h=h, horizon=round(STUDY.config.task.horizon / share))
+    old = STUDY.config.ppo
+    rates = {"gamma": old.gamma**share, "gae_lambda": old.gae_lambda**share}
+    about = f"the same, trained at a control period of {1e3 * h:g} ms"
+    config = replace(STUDY.config, task=task, ppo=replace(old, steps=task.horizon, **rates))
+    names = ("cppo", "ppo", "ppo_raw")
+    tests = tuple(
+        Test(shift, _FEW, change(shift), same if shift == "nominal" else paper) for shift in SHIFTS
+    )
+    methods = {name: METHODS[name] for name in names}
+    name = f"peg_touch_{1e3 * h:g}ms"
+    return replace(STUDY, name=name, about=about, config=config, methods=methods, tests=tests)
+
+
+VARIANTS = {study.name: study for study in (at_period(0.002), at_period(0.005))}
+
+
+# -- names of earlier days, for lessons that still use them --
+
+TestConfig, NAME = peg_touch_tests.TestConfig, STUDY.name
+PegTouchStudy, run_test = TouchConfig, measure
+
+
+def task_of(name: str) -> PegTouchConfig:
+    """The environment as a method sees it."""
+    task: PegTouchConfig = STUDY.config_of(name).task
+    return task
+
+
+def build(name: str, seeds: Sequence[int] | None = None, _: Any = None) -> nn.Module:
+    """An untrained policy."""
+    training: Any = STUDY.method(name).build(STUDY.config_of(name), seeds)  # type: ignore[arg-type]
+    return training.network  # type: ignore[no-any-return]
+
+
+def load(
+    name: str, episode: int | None = None, *, seed: int | None = None, path: Any = None
+) -> nn.Module:
+    """A trained policy; with a seed, one without the leading axis."""
+    policy: nn.Module = runner.load(STUDY, name, episode, seed=seed, path=path).policy
+    if seed is None:
+        return policy
+    alone = build(name)
+    alone.load_state_dict(policy.state_dict(), strict=False)
+    return alone.eval()
+
+
+def contents(name: str, path: Any = None) -> tuple[list[int], dict[str, Any]]:
+    """The episodes of which policies are kept, and the record of the run."""
+    tensors, record = store.load_checkpoint(path or runner.find(STUDY, name))
+    return runner.marks_of(tensors), record
+
+
+def results() -> dict[str, Any]:
+    """The figures of earlier days."""
+    return store.read_json(store.asset("results", "peg_touch.json"))
+
+
+def select(answer: dict[str, Any], *, shift: str = "nominal", h: float = 0.01) -> list[Any]:
+    """The tests of one method under one shift and control period, by episode."""
+    return [t for t in answer["tests"] if t["shift"] == shift and t["h"] == h]
+
+
+def at(answer: dict[str, Any], episode: Any, *, shift: str = "nominal", h: float = 0.01) -> Any:
+    """The test of one method at one episode."""
+    return next(t for t in select(answer, shift=shift, h=h) if t["episode"] == episode)

@@ -1,16 +1,16 @@
-"""What is guaranteed about each kept policy of the peg-touch study, from its weights alone."""
+"""What is guaranteed about a peg-touch policy, from its weights alone."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import nn
 
+from cmc.envs.peg_touch_config import PegTouchConfig
 from cmc.plants import Lags
-from cmc.studies.peg_touch_methods import method
-from cmc.studies.peg_touch_training import PegTouchStudy, contents, load, slope_limit, task_of
+from cmc.studies.study import Rows
 from cmc.theory.certify import certify
 
 Array = NDArray[np.float64]
@@ -27,60 +27,58 @@ class _Bounds:
         return self.bounds
 
 
-def certificates(name: str, path: str | Path | None = None) -> list[dict[str, Any]]:
-    """One entry for each kept policy; see `certificate_of` for what is in it."""
-    if not method(name).trained:
-        return [certificate_of(name, None)]
-    marks, _ = contents(name, path)
-    return [certificate_of(name, mark, path) for mark in marks]
-
-
-def certificate_of(
-    name: str, episode: int | None, path: str | Path | None = None
-) -> dict[str, Any]:
-    """What holds for one kept policy; lists have one entry for each seed.
+def certificates(policy: nn.Module, task: PegTouchConfig, limit: Array) -> Rows:
+    """What holds for each seed of a policy.
 
     In contact and in the coordinates (x, z) the peg is two separate lags with gains 1 and K,
     exactly; the surface only couples the first into the second. Each loop can be judged alone.
 
+    Args:
+        policy: with `slope_bounds`.
+        task: at the nominal lags.
+        limit: what k1 + (h/2) k2 must stay below for the worst plant of the design, (2,).
+
     Returns:
-        `signs`: every slope has the right sign, everywhere: each linearization is a stable
-        continuous loop (the paper's condition).
-        `largest_slope`: k1 + (h/2) k2 of each dimension, bounded by the product of the weights.
+        Rows with `seed` (position), `signs`: every slope has the right sign, everywhere: each
+        linearization is a stable continuous loop (the paper's condition).
+        `slope_x`, `slope_z`: k1 + (h/2) k2, bounded by the product of the weights.
         `stiffest`: stiffness up to which the sampled loop of every linearization is stable at the
-        nominal lags [N/m]; `x_margin`: the same for the horizontal loop, as a factor on its gain.
-        `design`: whether the bound is met for the shortest lags and the stiffest surface of the
-        design, everywhere.
+        nominal lags [N/m]; `stiffness_factor`: the same over the stiffest of the training set;
+        `x_margin`: the same for the horizontal loop, as a factor on its gain.
+        `design`: whether `limit` is met, everywhere.
         `contracting`, `rate`: whether one quadratic metric proves contraction for all slopes that
         the weights allow, sampled, on the softest and the stiffest surface of the training set.
-        `reason`: why the first of them is not proved to contract.
+        `reason`: why not.
     """
-    study, task = PegTouchStudy(), task_of(name)
-    lower, upper = load(name, episode, path=path).slope_bounds()  # type: ignore[operator]
-    lower, upper = lower.reshape(-1, 2, 2), upper.reshape(-1, 2, 2)
+    lower, upper = (b.reshape(-1, 2, 2) for b in policy.slope_bounds())  # type: ignore[operator]
     steepest = upper[..., 0] + 0.5 * task.h * upper[..., 1]
-    reference = task.stiffness_reference
     nominal = 1.0 / np.tanh(task.h / (2.0 * np.array([task.tau_x, task.tau_z])))
-    found = [_contraction(name, low, high, study) for low, high in zip(lower, upper, strict=True)]
     # a cap on the loop gain allows any nominal stiffness: what counts is the factor on it
+    reference = task.stiffness_reference
     gain = nominal[1] / steepest[:, 1] / (1.0 if reference is None else reference)
-    return {
-        "episode": episode,
-        "signs": bool((lower >= 0.0).all()),
-        "largest_slope": np.round(steepest, 6).tolist(),
-        "stiffest": None if reference is not None else np.round(gain, 3).tolist(),
-        "stiffness_factor": np.round(gain / (1.0 if reference else task.K_sur[1]), 3).tolist(),
-        "x_margin": np.round(nominal[0] / steepest[:, 0], 3).tolist(),
-        "design": [bool((s < slope_limit(name, study)).all()) for s in steepest],
-        "contracting": [all(part.holds for part in pair) for pair in found],
-        "rate": [min((part.rate for part in pair if part.holds), default=None) for pair in found],
-        "reason": next((part.reason for pair in found for part in pair if not part.holds), ""),
-    }
+    rows = []
+    for k, (low, high) in enumerate(zip(lower, upper, strict=True)):
+        found = _contraction(low, high, task)
+        rows.append(
+            {
+                "seed": k,
+                "signs": bool((lower >= 0.0).all()),
+                "slope_x": steepest[k, 0],
+                "slope_z": steepest[k, 1],
+                "stiffest": None if reference is not None else gain[k],
+                "stiffness_factor": gain[k] / (1.0 if reference is not None else task.K_sur[1]),
+                "x_margin": nominal[0] / steepest[k, 0],
+                "design": bool((steepest[k] < limit).all()),
+                "contracting": all(part.holds for part in found),
+                "rate": min((part.rate for part in found if part.holds), default=None),
+                "reason": next((part.reason for part in found if not part.holds), ""),
+            }
+        )
+    return rows
 
 
-def _contraction(name: str, low: Array, high: Array, study: PegTouchStudy) -> list[Any]:
+def _contraction(low: Array, high: Array, task: PegTouchConfig) -> list[Any]:
     """Certificates of one seed for the softest and the stiffest surface of the training set."""
-    task = task_of(name, study)
     gains = task.K_sur if task.stiffness_reference is None else [task.stiffness_reference]
     plants = [Lags(tau=(task.tau_x, task.tau_z), gain=(1.0, gain)) for gain in gains]
     return [certify(_Bounds(low, high), plant, h=task.h) for plant in plants]

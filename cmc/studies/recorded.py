@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from cmc import store, studies
+from cmc import store
+from cmc.studies import registry
 
 _ARRAYS = ("t", "qpos", "tip", "force", "distance")
 _ENDS = ("success", "touched")
@@ -26,7 +27,7 @@ def save(path: str | Path, motion: Mapping[str, Any], record: Mapping[str, Any])
 
     Args:
         path: an npz file.
-        motion: what `cmc.studies.STUDY.motion` returns.
+        motion: what a study's `motion` returns.
         record: JSON record with `study` and `method` (of the configuration that made the scene).
 
     Raises:
@@ -62,8 +63,7 @@ def load(path: str | Path) -> dict[str, Any]:
             arrays = {name: found[name] for name in found.files}
         record = json.loads(str(arrays.pop("record")))
         motion: dict[str, Any] = {name: arrays.pop(name) for name in _ARRAYS}
-        study = studies.get(record["study"]).STUDY.of(record["method"])
-        model = study.task_class(study.task).worlds.model
+        model = registry.get(record["study"]).config_of(record["method"]).make(1).worlds.model
     except FileNotFoundError:
         raise
     except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile) as error:

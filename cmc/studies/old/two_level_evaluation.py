@@ -13,8 +13,8 @@ from torch import nn
 from cmc.learning.hierarchy import low_fields
 from cmc.learning.low_level import Fixed, LowLevel, evaluate
 from cmc.robot.panda import FINGERTIP, JOINTS, inverse_kinematics
-from cmc.studies.two_level import TwoLevelStudy
-from cmc.studies.two_level_parts import N
+from cmc.studies.old.two_level import TwoLevelStudy
+from cmc.studies.old.two_level_parts import N
 
 Array = NDArray[np.float64]
 TEST_SEED = 900_000  # test worlds never share a stream with training

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from functools import partial
 
-from cmc.studies import two_level_motion, two_level_results, two_level_training
-from cmc.studies.peg_maze import STIFF_STUDY as STUDY
+from cmc.studies.old import two_level_motion, two_level_training
+from cmc.studies.old.peg_maze import STIFF_STUDY as STUDY
 
 NAME = STUDY.name
 METHODS = STUDY.methods
 train = partial(two_level_training.train, STUDY)
-evaluate = partial(two_level_results.evaluate, STUDY)
 load = partial(two_level_training.load, STUDY)
 motion = partial(two_level_motion.motion, STUDY)

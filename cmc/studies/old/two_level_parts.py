@@ -25,7 +25,7 @@ from cmc.policies import (
     PositiveNetwork,
 )
 from cmc.robot.panda import LOWER, UPPER
-from cmc.studies.two_level import Arm, TwoLevelStudy, start_joints
+from cmc.studies.old.two_level import Arm, TwoLevelStudy, start_joints
 
 Array = NDArray[np.float64]
 N = 6  # dimensions of a pose

@@ -15,8 +15,8 @@ from torch import nn
 from cmc import store
 from cmc.learning.low_level import Fixed
 from cmc.learning.state import interruptions, plain, single_thread
-from cmc.studies.two_level import Callback, TwoLevelStudy
-from cmc.studies.two_level_parts import Trainer, build, frozen
+from cmc.studies.old.two_level import Callback, TwoLevelStudy
+from cmc.studies.old.two_level_parts import Trainer, build, frozen
 
 SAVE_EVERY = 100.0
 """Seconds of wall time between two saves of a training's state."""

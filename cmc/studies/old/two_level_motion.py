@@ -10,9 +10,9 @@ import numpy as np
 from cmc.learning.hierarchy import low_fields
 from cmc.learning.low_level import evaluate
 from cmc.learning.state import single_thread
-from cmc.studies.two_level import TwoLevelStudy
-from cmc.studies.two_level_evaluation import TEST_SEED
-from cmc.studies.two_level_training import load
+from cmc.studies.old.two_level import TwoLevelStudy
+from cmc.studies.old.two_level_evaluation import TEST_SEED
+from cmc.studies.old.two_level_training import load
 
 
 def motion(

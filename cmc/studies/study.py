@@ -1,0 +1,165 @@
+"""What a study is: methods that can be trained, and tests. Studies describe, `runner` runs them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import nn
+
+Array = NDArray[np.float64]
+Rows = list[dict[str, Any]]
+
+
+class Training(Protocol):
+    """A method's training of several seeds side by side."""
+
+    @property
+    def steps(self) -> int:
+        """Environment steps, or episodes, of each seed so far."""
+
+    @property
+    def stride(self) -> int:
+        """How many `segment` adds."""
+
+    def segment(self) -> Array:
+        """Go on; mean reward or return by seed, (seeds,)."""
+
+    def actors(self) -> Mapping[str, nn.Module]:
+        """The networks that act, by the name under which their weights are kept."""
+
+    def acting(self) -> Any:
+        """What acts now, without exploration, as the study's tests take it."""
+
+    def save(self, path: str | Path, record: Mapping[str, Any]) -> None:
+        """Write everything that decides what follows."""
+
+    def load(self, path: str | Path, record: Mapping[str, Any]) -> None:
+        """Continue from `save`."""
+
+
+def same(config: Any) -> Any:
+    """No change of a configuration."""
+    return config
+
+
+@dataclass(frozen=True)
+class Method:
+    """One arm of a study.
+
+    Attributes:
+        title: in figures and tables.
+        build: its untrained training, from the configuration and the seeds.
+        adapt: the study's configuration to the method's own.
+        trained: False for fixed gains.
+    """
+
+    title: str
+    build: Callable[[Any, Sequence[int]], Training]
+    adapt: Callable[[Any], Any] = same
+    trained: bool = True
+
+
+@dataclass(frozen=True)
+class Test:
+    """One condition under which kept policies are tested.
+
+    Attributes:
+        name: in tables; several tests of other policies may share it.
+        number: episodes of each seed.
+        change: the method's configuration to that of the test.
+        when: which of the kept policies are tested, from their steps in rising order.
+        methods: names; all if None.
+    """
+
+    __test__ = False  # not a pytest class
+
+    name: str
+    number: int
+    change: Callable[[Any], Any] = same
+    when: Callable[[Sequence[int]], Iterable[int]] = same
+    methods: tuple[str, ...] | None = None
+
+
+def last(marks: Sequence[int]) -> Sequence[int]:
+    """The last kept policy."""
+    return marks[-1:]
+
+
+def before_last(marks: Sequence[int]) -> Sequence[int]:
+    """All kept policies but the last."""
+    return marks[:-1]
+
+
+@dataclass(frozen=True)
+class Study:
+    """Methods, the configuration that they share, and how they are tested.
+
+    Attributes:
+        name: of the study, its files and its folder.
+        about: one line.
+        config: a frozen dataclass that everything in a run depends on.
+        methods: by name.
+        tests: what `evaluate` does.
+        length: of a training, of each seed.
+        every: how far apart policies are kept.
+        judge: one test of one policy: (config, policy, seeds, test) to rows by table; `seed` is a
+            position in a row.
+        motion: one episode as arrays, for `play`: (config, policy of one seed, number of the start)
+            to `text` and what the picture needs.
+        light: a configuration that builds faster and acts the same, for loading.
+        shown: of which kept policies tables other than `tests` are kept.
+        unit: what `length` counts, and the name of its column in tables.
+        gain: what a training's curve shows, and the name of its column.
+    """
+
+    name: str
+    about: str
+    config: Any
+    methods: Mapping[str, Method]
+    tests: tuple[Test, ...]
+    length: int
+    every: int
+    judge: Callable[[Any, Any, int, Test], dict[str, Rows]]
+    motion: Callable[[Any, Any, int], dict[str, Any]]
+    light: Callable[[Any], Any] = same
+    shown: Callable[[Sequence[int]], Iterable[int]] = last
+    unit: Literal["step", "episode"] = "step"
+    gain: Literal["reward", "return"] = "reward"
+
+    def __post_init__(self) -> None:
+        for name in ("length", "every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: wanted at least 1, got {getattr(self, name)}")
+
+    def method(self, name: str) -> Method:
+        """The method of this name.
+
+        Raises:
+            ValueError: if there is none.
+        """
+        if name not in self.methods:
+            raise ValueError(f"unknown method {name!r}; wanted one of {', '.join(self.methods)}")
+        return self.methods[name]
+
+    def config_of(self, name: str) -> Any:
+        """The configuration as a method runs it."""
+        return self.method(name).adapt(self.config)
+
+    def build(self, name: str, seeds: Sequence[int]) -> Training:
+        """A method's training, not yet begun.
+
+        Raises:
+            ValueError: for an unknown method, or no seed.
+        """
+        if len(seeds) == 0:
+            raise ValueError("seeds: wanted at least one, got none")
+        return self.method(name).build(self.config_of(name), seeds)
+
+    def variant(self, name: str, about: str, **changes: Any) -> Study:
+        """This study under another name, with some fields of its configuration changed."""
+        return replace(self, name=name, about=about, config=replace(self.config, **changes))
