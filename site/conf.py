@@ -19,12 +19,11 @@ myst_enable_extensions = ["dollarmath", "colon_fence"]
 myst_heading_anchors = 3
 suppress_warnings = ["mystnb.unknown_mime_type", "myst.header", "ref.python"]
 
-# The notebooks come executed; sliders are self-contained HTML, so no widget manager is loaded.
+# The notebooks come executed; static/widgets.js plays their widgets, no widget manager is loaded.
 nb_execution_mode = "off"
 nb_merge_streams = True
 nb_mime_priority_overrides = [
-    ("html", "text/html", 0),
-    ("html", "application/vnd.jupyter.widget-view+json", None),
+    ("html", "application/vnd.jupyter.widget-view+json", 0),
 ]
 nb_ipywidgets_js = {}
 
@@ -42,10 +41,14 @@ html_theme = "pydata_sphinx_theme"
 html_title = "cmc"
 html_static_path = ["static"]
 html_css_files = ["cmc.css"]
+html_js_files = ["widgets.js"]
+html_sidebars = {"**": []}
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {
     "navbar_align": "left",
+    "header_links_before_dropdown": 4,
+    "default_mode": "auto",
     "show_toc_level": 2,
     "secondary_sidebar_items": ["page-toc"],
     "footer_start": ["copyright"],
