@@ -13,13 +13,14 @@ INSTALL := $(PIP) install --quiet $(PIP_FLAGS) --constraint constraints.txt
 # One thread a process: the checks run $(JOBS) processes side by side.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help course test lint types unit notebooks bench site clean browser
+.PHONY: help course test lint types unit notebooks bench claims site clean browser
 
 help:
 	@echo "make course   install what the course needs and open it in JupyterLab"
 	@echo "make test     install what the checks need and run all of them"
 	@echo "make lint     formatting, lint, types, stripped notebooks"
 	@echo "make bench    speed, as ratios measured in one run"
+	@echo "make claims   write site/claims.md from the shipped results"
 	@echo "make site     build the static site in build/site, offline"
 	@echo "make clean    remove .venv, caches and build products"
 
@@ -45,6 +46,9 @@ notebooks: $(VENV)/.dev-installed
 
 browser: $(VENV)/.dev-installed
 	@$(BIN)/python tests/find_browser.py --install
+
+claims: $(VENV)/.dev-installed
+	$(BIN)/python -m cmc.studies.claims
 
 site: $(VENV)/.dev-installed
 	$(BIN)/python site/build.py --jobs $(JOBS)
