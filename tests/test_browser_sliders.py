@@ -30,7 +30,7 @@ def motion(damping, count=50):
     }
 
 
-def explorer(time=None):
+def explorer(time=None, frames=False):
     grid = np.stack(np.meshgrid(np.linspace(-2, 2, 9), np.linspace(-2, 2, 9)), axis=-1)
     return ui.explore(
         motion,
@@ -54,7 +54,7 @@ def explorer(time=None):
         ui.panel(ui.cells("F"), x="", y="", title="$F$"),
         damping=ui.slider(0.0, 2.0, 1.0, step=0.2, unit="1/s"),
         time=time,
-        frames=True,
+        frames=frames,
         describe="Oscillations die out faster when damping grows.",
     )
 
@@ -100,7 +100,7 @@ if (content.table.words) {{
 const controls = content.states.map((state) => new Model(state));
 const model = new Model(content);
 model.widget_manager = {{ get_model: async (id) => controls[content.controls.indexOf(id)] }};
-await initialize({{ model }});
+await connect(model, content.controls);
 window.remove = render({{ model, el: document.getElementById("view") }});
 Object.assign(window, {{ model, controls }});
 // Arrow keys on the handle move the first control, as the slider of ipywidgets does.
@@ -142,7 +142,7 @@ def host_page(live, file, color="#111"):
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    return host_page(explorer(time="t"), tmp_path_factory.mktemp("page") / "page.html")
+    return host_page(explorer(time="t", frames=True), tmp_path_factory.mktemp("page") / "page.html")
 
 
 @pytest.fixture
@@ -292,7 +292,7 @@ def test_an_error_is_shown_and_taken_back(host):
 def test_of_frames_that_pile_up_only_the_newest_is_drawn(host):
     live = explorer()
     frames = []
-    for k in range(30):
+    for k in range(8):
         live.evaluate(damping=0.05 * k)
         frames.append(sent(live.canvas.frame))
     host.evaluate(

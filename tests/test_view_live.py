@@ -95,3 +95,64 @@ def test_live_view_answers_no_foreign_host_or_origin(model):
 
         with pytest.raises(HTTPClientError, match="403"):
             asyncio.run(knock())
+
+
+def stalled(live):
+    """A browser that opens the socket and then reads nothing."""
+    lazy = socket.create_connection(("127.0.0.1", live.port))
+    lazy.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
+    lazy.sendall(
+        (
+            f"GET /socket HTTP/1.1\r\nHost: 127.0.0.1:{live.port}\r\nUpgrade: websocket\r\n"
+            "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+            "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+        ).encode()
+    )
+    return lazy
+
+
+def test_a_browser_that_stops_reading_starves_nobody(model):
+    """Others follow, the view closes at once, and its port is free."""
+    qpos, _, times = tumble(model, frames=1)
+    data = mujoco.MjData(model)
+    live = record(model, qpos, times).serve(timeout=60)
+    with stalled(live):
+        while not live.sockets:
+            time.sleep(0.01)
+        heavy = live.visualizer["heavy"]
+        for _ in range(40):  # more than any buffer on the way holds
+            heavy.set_property("note", "x" * 1_000_000)
+            time.sleep(0.02)
+
+        def act():
+            data.qpos[0] = 0.5
+            mujoco.mj_kinematics(model, data)
+            live.update(data)
+
+        assert any(browser.waiting for browser in live.sockets)  # it does not get them
+        live.visualizer["last"].set_property("visible", True)
+        _, fresh = asyncio.run(follow(live.url, 4, act))
+        assert any(c["path"] == "/meshcat/torso" for c in fresh)
+        began = time.monotonic()
+        live.close()
+        assert live.closed
+        assert time.monotonic() - began < 4
+    assert refused(live.port)
+
+
+def test_what_a_browser_sends_moves_nothing(model):
+    qpos, _, times = tumble(model, frames=1)
+    with record(model, qpos, times).serve(timeout=30) as live:
+        before = dict(live.commands)
+
+        async def shout():
+            client = await websocket_connect(live.url.replace("http", "ws") + "socket")
+            await client.write_message(umsgpack.packb({"type": "delete", "path": "/"}), binary=True)
+            await client.write_message("x" * 1000)
+            await asyncio.wait_for(client.read_message(), 5)
+            client.close()
+
+        asyncio.run(shout())
+        assert live.commands == before
+        with urllib.request.urlopen(live.url, timeout=5) as answer:
+            assert "frame-ancestors" in answer.headers["Content-Security-Policy"]

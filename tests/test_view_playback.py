@@ -57,6 +57,13 @@ def page_id_of(scene):
     return page_id([scene])
 
 
+@pytest.fixture(autouse=True)
+def served(monkeypatch):
+    """As in JupyterLab, whatever the tests run in."""
+    for name in ("CMC_EMBED", "VSCODE_PID", "SERVER_SOFTWARE"):
+        monkeypatch.delenv(name, raising=False)
+
+
 @pytest.fixture(scope="module")
 def model():
     return mujoco.MjModel.from_xml_string(SCENE)
@@ -299,6 +306,18 @@ def test_embedded_in_the_notebook_without_a_file(recording, tmp_path, monkeypatc
     markup = html_.unescape(recording.show()._repr_html_())
     assert recording.html() in markup
     assert 'sandbox="allow-scripts"' in markup
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("CMC_EMBED", "1"), ("VSCODE_PID", "7"), ("SERVER_SOFTWARE", "voila/0.5")]
+)
+def test_embedded_where_no_server_would_deliver_a_file(
+    recording, tmp_path, monkeypatch, name, value
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(name, value)
+    assert "srcdoc=" in recording.show("playback/tumble.html")._repr_html_()
     assert list(tmp_path.iterdir()) == []
 
 

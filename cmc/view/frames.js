@@ -70,9 +70,13 @@ class Table {
   }
 }
 
-async function initialize({ model }) {
+// anywidget gives a widget two seconds to begin, and other widgets may take longer: no waiting here.
+function initialize({ model }) {
   const ids = model.get("controls");
-  if (!ids?.length) return;
+  if (ids?.length) connect(model, ids);
+}
+
+async function connect(model, ids) {
   const controls = await Promise.all(ids.map((id) => model.widget_manager.get_model(id)));
   const values = model.get("values");  // of sliders; null where a control has an index or is a box
   const index = (k) => {

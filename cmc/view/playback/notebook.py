@@ -7,6 +7,8 @@ without a picture that passes its value on by `postMessage`: no kernel takes par
 from __future__ import annotations
 
 import html
+import os
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,7 +61,7 @@ def show(
     """
     text = page(scenes, slider=slider is None)
     frame: Any = Embedded(text, height)
-    if path is not None:
+    if path is not None and not must_embed():
         path = Path(path)
         if path.is_absolute() or ".." in path.parts:
             raise ValueError(f"path must be relative and below the notebook, got {path}")
@@ -70,6 +72,17 @@ def show(
     link = SceneLink(scene=page_id(scenes))
     ipywidgets.jslink((slider, "value"), (link, "value"))
     return ipywidgets.VBox([ipywidgets.HTML(frame._repr_html_()), slider, link])
+
+
+def must_embed() -> bool:
+    """Whether no server here would deliver a file beside the notebook, or CMC_EMBED is 1."""
+    served = os.environ.get("SERVER_SOFTWARE", "")
+    return (
+        os.environ.get("CMC_EMBED", "0") not in ("", "0")
+        or "VSCODE_PID" in os.environ
+        or "google.colab" in sys.modules
+        or served.startswith("voila")
+    )
 
 
 @dataclass(frozen=True)

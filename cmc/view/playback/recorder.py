@@ -52,8 +52,9 @@ class Playable:
     def show(self, path: str | Path | None = None, height: int = 480, slider: Any = None) -> Any:
         """The page for a notebook to display: saved to `path`, or embedded without one.
 
-        A saved page keeps the notebook small, but needs a server that delivers it (JupyterLab); an
-        embedded one (1 MB more) also appears in VS Code, Colab, voila and exported HTML.
+        A saved page keeps the notebook small, but needs a server that delivers it (JupyterLab).
+        In VS Code, Colab and voila, or with CMC_EMBED=1 (for exported HTML), the page is embedded
+        all the same, which takes 1 MB.
 
         Args:
             path: where to save, relative to the notebook.
