@@ -4,6 +4,7 @@
     demo["largest_real_part"](demo["plant"], 1.0)
     other = lesson("02", plant="plant = ...")  # the same, with another plant cell
     whole = run("02", plant="plant = ...")     # every cell; whole.text is what it printed
+    done = run("02", solved=True)              # with the exercises solved
 
 Cells tagged `plant` and `setup` run whole. Of all other cells `lesson` runs imports, functions,
 classes and assignments of literals; `run` runs everything.
@@ -14,6 +15,9 @@ from __future__ import annotations
 import ast
 import contextlib
 import io
+import os
+import runpy
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -45,10 +49,23 @@ def lesson(number: str, plant: str | None = None) -> dict[str, Any]:
     return space
 
 
-def run(number: str, plant: str | None = None) -> SimpleNamespace:
-    """Run every cell in one process: `.space` holds the names, `.text` what was printed.
+def run(
+    number: str,
+    plant: str | None = None,
+    solved: bool = False,
+    skip: str = "",
+    drawn: bool = False,
+) -> SimpleNamespace:
+    """Run every cell in one process, in fast mode: `.space` holds the names, `.text` the output.
 
     Errors of a cell are raised as they are; figures are closed.
+
+    Args:
+        number: the lesson.
+        plant: source that takes the place of the cell tagged `plant`.
+        solved: let the functions and values of the solutions take the place of the stubs.
+        skip: tag of cells to leave out.
+        drawn: turn figures into pixels (half of the time of a run).
     """
     import matplotlib
 
@@ -57,11 +74,46 @@ def run(number: str, plant: str | None = None) -> SimpleNamespace:
 
     space: dict[str, Any] = {"__name__": f"lesson_{number}"}
     printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
+    with contextlib.redirect_stdout(printed), _fast(drawn):
         for cell in cells(number, plant):
-            exec(compile(cell.source, f"lesson {number}", "exec"), space)
+            if not skip or skip not in cell.metadata.get("tags", []):
+                tree = ast.parse(cell.source)
+                if solved and "exercises.check(" in cell.source:
+                    tree.body = [node for node in tree.body if not _is_stub(node)]
+                    space |= solutions(number)
+                exec(compile(tree, f"lesson {number}", "exec"), space)
     plt.close("all")
     return SimpleNamespace(space=space, text=printed.getvalue())
+
+
+@contextlib.contextmanager
+def _fast(drawn: bool) -> Iterator[None]:
+    """Fast mode, and figures that are built but, unless `drawn`, not turned into pixels."""
+    from matplotlib.figure import Figure
+
+    before, savefig = os.environ.get("CMC_FAST"), Figure.savefig
+    os.environ["CMC_FAST"] = "1"
+    if not drawn:
+        Figure.savefig = lambda *_, **__: None  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        Figure.savefig = savefig  # type: ignore[method-assign]
+        os.environ.pop("CMC_FAST")
+        os.environ.update({} if before is None else {"CMC_FAST": before})
+
+
+def solutions(number: str) -> dict[str, Any]:
+    """What the lesson's solutions define."""
+    (path,) = (NOTEBOOKS / "solutions").glob(f"{number}_*.py")
+    return {k: v for k, v in runpy.run_path(str(path)).items() if not k.startswith("__")}
+
+
+def _is_stub(node: ast.stmt) -> bool:
+    text = ast.unparse(node)
+    return text.endswith("= ...") or (
+        isinstance(node, ast.FunctionDef) and "raise NotImplementedError" in text
+    )
 
 
 def _defines(node: ast.stmt) -> bool:

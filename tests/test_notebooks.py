@@ -96,6 +96,76 @@ def test_code_cells_are_short(path):
         assert length <= LONGEST, f"{length} lines: {cell.source[:60]!r} ..."
 
 
+DRAWING = {"figures", "ui", "schematics", "fig", "ax", "axes"}
+
+
+def statements(body):
+    """(statement, its lines) of a cell, functions and loops opened, imports left out."""
+    for node in body:
+        inner = [*getattr(node, "body", []), *getattr(node, "orelse", [])]
+        lines = node.end_lineno - node.lineno + 1
+        if inner:
+            found = list(statements(inner))
+            yield node, lines - sum(length for _, length in found)
+            yield from found
+        elif not isinstance(node, ast.Import | ast.ImportFrom):
+            yield node, lines
+
+
+def draws(node):
+    """Whether a statement is about the picture: it names figures, sliders or axes."""
+    head = [node.iter, node.target] if isinstance(node, ast.For) else [node]
+    if hasattr(node, "body") and not isinstance(node, ast.For):
+        return False
+    names = {x.id for part in head for x in ast.walk(part) if isinstance(x, ast.Name)}
+    return bool(names & DRAWING)
+
+
+def by_opened_notebook(test):
+    opened = [path for path in NOTEBOOKS if path.name[:2] not in ("11", "12")]
+    return pytest.mark.parametrize("path", opened, ids=lambda p: p.stem)(test)
+
+
+@by_opened_notebook
+def test_at_most_a_third_of_the_lines_draws(path):
+    found = [s for cell in code(path) for s in statements(ast.parse(cell.source).body)]
+    drawn = sum(lines for node, lines in found if draws(node))
+    total = sum(lines for _, lines in found)
+    assert 3 * drawn <= total, f"{drawn} of {total} lines"
+
+
+def openness(cell):
+    """How much of a cell's idea stands in it: "visible", "library" (a call to edit), "opaque".
+
+    Visible: a function is defined, or at least three arithmetic operations or numpy calls stand
+    outside of what draws. Library: a call with arguments. None for cells that only import, draw,
+    or ask for an exercise.
+    """
+    tree = ast.parse(cell.source)
+    kept = [n for n in tree.body if not isinstance(n, ast.Import | ast.ImportFrom) and not draws(n)]
+    inside = [x for node in kept for x in ast.walk(node)]
+    if not any(isinstance(x, ast.Call | ast.BinOp) for x in inside) or list(calls(tree, "check")):
+        return None
+    if any(isinstance(x, ast.FunctionDef) for x in inside):
+        return "visible"
+    worked = [x for x in inside if isinstance(x, ast.BinOp)] + [
+        x for x in inside if isinstance(x, ast.Call) and ast.unparse(x.func).startswith("np.")
+    ]
+    if len(worked) >= 3:
+        return "visible"
+    asked = [x for x in inside if isinstance(x, ast.Call) and (x.args or x.keywords)]
+    asked = [x for x in asked if ast.unparse(x.func) not in ("print", "Markdown")]
+    return "library" if asked else "opaque"
+
+
+@by_opened_notebook
+def test_the_idea_stands_in_the_cells(path):
+    kinds = [kind for cell in code(path) if (kind := openness(cell))]
+    count = {kind: kinds.count(kind) for kind in ("visible", "library", "opaque")}
+    assert 2 * count["visible"] >= len(kinds), count
+    assert 5 * count["opaque"] <= len(kinds), count
+
+
 @by_notebook
 def test_a_described_figure_comes_before_the_first_slider(path):
     sources = [cell.source for cell in code(path)]
@@ -120,7 +190,7 @@ def test_the_first_notebook_links_to_all_others():
 
 
 def stubs(path):
-    found = [cell for cell in code(path) if "raise NotImplementedError" in cell.source]
+    found = [cell for cell in code(path) if list(calls(ast.parse(cell.source), "check"))]
     assert found, "no exercise"
     return found
 

@@ -53,7 +53,7 @@ def check(name: str, *answer: Any) -> Any:
 
     Args:
         name: the exercise, `"NN-short-title"`.
-        answer: what the reader wrote: a function, an array or a number.
+        answer: what the reader wrote: a function, an array or a number; `...` is not written yet.
 
     Returns:
         A `Verdict`, or the decorator. A wrong or unwritten answer, or one that fails, is a verdict
@@ -68,6 +68,8 @@ def check(name: str, *answer: Any) -> Any:
     if not answer:
         return lambda judge: _register(name, judge)
     _find(name)
+    if answer[0] is ...:
+        return Verdict(False, f"{name}: not written yet.")
     try:
         judge(name, *answer)
     except NotImplementedError:

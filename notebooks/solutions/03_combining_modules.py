@@ -1,6 +1,14 @@
-"""Solution of the exercise of lesson 03."""
+"""Solutions of the exercises of lesson 03."""
 
 import numpy as np
+
+
+def my_limit(a, b):
+    """Largest c with a negative determinant condition: c^2 < a b."""
+    return np.sqrt(a * b)
+
+
+my_weight = 1000.0
 
 
 def my_B(s, w, p, q):

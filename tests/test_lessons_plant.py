@@ -1,0 +1,176 @@
+"""Another plant in a lesson's plant cell: the lesson answers about it, or refuses in one line."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+
+import numpy as np
+import pytest
+from lesson import run
+from scipy.linalg import expm
+
+Y_STAR = "\ny_star = np.zeros(plant.n)"
+PLANTS = {
+    "real": ([[-1.0, 0.3], [0.0, -2.0]], [[1.0, 0.2], [0.1, 1.0]]),
+    "three": (
+        [[-2.0, 1.0, 0.0], [0.5, -1.0, 0.3], [0.0, 0.2, -0.5]],
+        [[1.0, 2.0, 0.0], [1.5, 1.0, 0.3], [0.2, 0.1, 1.0]],
+    ),
+    "complex": ([[-0.6, 3.0], [-2.0, -0.2]], [[1.0, 0.3], [-0.5, 1.2]]),
+    "unstable": ([[-1.0, 3.0], [0.5, -1.0]], [[0.5, -1.5], [-1.0, 1.5]]),
+    "defective": ([[-1.0, 1.0], [0.0, -1.0]], [[1.0, 0.2], [0.3, 1.0]]),
+}
+"""f_y and f_u of each, 1/s."""
+EVERY = pytest.mark.parametrize("name", PLANTS)
+
+
+@cache
+def answer(number: str, name: str):
+    f_y, f_u = PLANTS[name]
+    return run(number, plant=f"plant = plants.LinearPlant({f_y}, {f_u}){Y_STAR}")
+
+
+def arrays(name):
+    return tuple(np.array(m) for m in PLANTS[name])
+
+
+def numbers(text, words):
+    """The numbers in the first printed line that contains `words`."""
+    line = next(line for line in text.splitlines() if words in line)
+    return [float(x) for x in re.findall(r"-?\d+\.?\d*(?:e[-+]\d+)?", line.split(words)[1])]
+
+
+def largest(M):
+    return np.linalg.eigvals(M).real.max()
+
+
+def loop(A, B, p, q):
+    n = len(A)
+    return np.block([[A + B @ np.diag(p), B @ np.diag(q)], [np.eye(n), np.zeros((n, n))]])
+
+
+@EVERY
+def test_01_rates_and_metric_are_those_of_the_plant(name):
+    lesson, (f_y, _) = answer("01", name), arrays(name)
+    slowest = -largest(f_y)
+    assert numbers(lesson.text, "slowest eigenvalue of f_y at y_star")[0] == pytest.approx(
+        slowest, abs=6e-4
+    )
+    h = 1e-6  # the plain rate as a derivative of the worst distance
+    plain = -(np.linalg.norm(expm(f_y * h), 2) - 1) / h
+    assert numbers(lesson.text, "proved in the plain distance")[0] == pytest.approx(plain, abs=1e-3)
+    if name != "defective":  # t e^-t is no line
+        assert numbers(lesson.text, "measured rate")[0] == pytest.approx(slowest, abs=0.05)
+    assert ("Refused" in lesson.text) == (slowest <= 0)
+    moved = lesson.space["pushed"](0.5)
+    np.testing.assert_allclose(moved["apart"], lesson.space["calm"]["apart"], rtol=1e-4, atol=1e-4)
+    J_h, M = lesson.space["lens"](2.0, 0.5)
+    np.testing.assert_allclose(np.poly(J_h), np.poly(f_y), atol=1e-8)
+    data = lesson.space["lean"](2.0, 0.5, 0.3)
+    np.testing.assert_allclose(data["circle_t"][0], expm(0.3 * J_h)[:2, 0], atol=1e-9)
+    if slowest > 0:
+        assert np.linalg.eigvalsh(J_h.T @ M + M @ J_h + slowest * M).max() < 1e-8
+    else:
+        assert "Refused: no metric" in data["text"]
+
+
+@EVERY
+def test_02_shares_are_those_of_the_plant(name):
+    lesson, (f_y, f_u) = answer("02", name), arrays(name)
+    space, n = lesson.space, len(f_y)
+    build = {"complex": "feedback", "defective": "schur"}.get(name, "decompose")
+    assert f"T_y and T_a come from {build}" in lesson.text
+    assert ("Refused: decompose" in lesson.text) == (build != "decompose")
+    np.testing.assert_allclose(space["T_y"] @ f_y, space["Lambda"] @ space["T_y"], atol=1e-9)
+    np.testing.assert_allclose(space["T_y"] @ f_u @ space["T_a"], space["R"], atol=1e-9)
+    k_p, k_i = space["k_p"][:400], space["k_i"][:400]
+    sign = -np.sign(np.diag(f_u))
+    worst = [largest(loop(f_y, f_u, sign * a, sign * b)) for a, b in zip(k_p, k_i, strict=True)]
+    np.testing.assert_allclose(space["straight"][:400], worst, atol=1e-8)
+    share = float(re.search(r"([\d.]+)% of \d+ loops decay", lesson.text)[1])
+    assert share == pytest.approx(100 * np.mean(np.array(worst) < 0), abs=8)
+    best = [
+        largest(loop(f_y, f_u[:, space["order"]] * space["signs"], -a, -b))
+        for a, b in zip(k_p[:50], k_i[:50], strict=True)
+    ]
+    np.testing.assert_allclose(space["swapped"][:50], best, atol=1e-8)
+    assert (space["auxiliary"] < 1e-9).all()  # the right signs, above the floor: always
+    assert ("Refused: this picture is a plane" in lesson.text) == (n != 2)
+    if n == 2:
+        J = numbers(space["warp"](1.0)["text"], "J_21 =")[0]
+        assert abs(J) < 0.01 or name == "complex"
+        R = space["turn"](space["right"])["R"]
+        assert abs(R[1, 0]) < 1e-3
+        np.testing.assert_allclose(
+            abs(np.linalg.det(R)), abs(np.linalg.det(space["T_y"] @ f_u)), rtol=0.02
+        )
+    out = space["coordinates"](1.0, 1.0, 1.0, "straight wires")
+    wanted = largest(loop(f_y, f_u, sign, sign))
+    assert f"{wanted:.3f}" in out["text"]
+    growth = space["leaning"](0.0)
+    t = growth["t"][7]
+    np.testing.assert_allclose(growth["y"][7], np.linalg.norm(expm(f_y * t), 2), rtol=1e-6)
+
+
+@EVERY
+def test_03_forms_are_those_of_the_plant(name):
+    lesson, (f_y, _) = answer("03", name), arrays(name)
+    space, n = lesson.space, len(f_y)
+    if name == "defective":
+        assert "This lesson goes on with the spiral." in lesson.text
+        return
+    np.testing.assert_allclose(space["f_y"], f_y)
+    eig = np.linalg.eigvals(f_y)
+    assert ("They exist: this plant has no complex pair." in lesson.text) == np.isreal(eig).all()
+    if n == 2:
+        gap = eig[0] - eig[1]
+        found = max(p.max() for p in space["products"].values())
+        assert found == pytest.approx((gap**2).real / 4, abs=2e-3)
+        verdict = "no T_y makes A triangular" if name == "complex" else "a hierarchy exists"
+        assert verdict in lesson.text
+    else:
+        assert "Refused: the figure turns a plane" in lesson.text
+    stable = eig.real.max() < 0
+    assert ("Refused: the form needs negative real parts" in lesson.text) == (not stable)
+    F = space["F"]
+    off = F + F.T
+    for i in range(n):
+        off[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = 0
+    np.testing.assert_allclose(off, 0.0, atol=1e-8)  # skew couplings, for every plant
+    assert (np.linalg.eigvalsh(F + F.T).max() < 0) == stable
+    if stable:
+        assert max(space["found"]["frozen"]) < 0
+        assert max(space["found"]["T_a without slopes"]) < 1e-6
+    assert (np.diff(space["V"]) < 1e-12).all()
+    row = next(row for row in space["rows"] if row[0] == "your plant")
+    assert row[1:] == [
+        "no" if name == "complex" else "yes",
+        "no" if name == "complex" else "yes",
+        "yes",
+        "yes" if stable else "no",
+    ]
+
+
+@EVERY
+def test_04_transforms_and_floors_are_those_of_the_plant(name):
+    lesson, (f_y, f_u) = answer("04", name), arrays(name)
+    space = lesson.space
+    if name in ("complex", "defective"):
+        assert lesson.text.splitlines()[1].startswith("Refused: f_y has")
+        assert "go on with the coupled lags" in lesson.text
+        return
+    np.testing.assert_allclose(space["f_y"], f_y)
+    for words in ("Lambda off its diagonal", "R below its diagonal", "T_a^T T_a against I"):
+        assert numbers(lesson.text, words)[-1] < 1e-9
+    eig = np.sort(np.linalg.eigvals(f_y).real)[::-1]
+    np.testing.assert_allclose(np.diag(space["Lambda"]), eig, atol=1e-9)
+    # |R_ii| by determinants: R = T_y f_u T_a with an orthogonal T_a
+    assert np.prod(abs(np.diag(space["space"].R))) == pytest.approx(
+        abs(np.linalg.det(f_u) / np.linalg.det(space["V"]))
+    )
+    lift = 0.8 - eig[0]
+    wanted = np.maximum(eig + lift, 0) / abs(np.diag(space["space"].R))
+    np.testing.assert_allclose(space["floor"], wanted, atol=1e-9)
+    for factor, decays in ((0.98, False), (1.02, True)):
+        assert (largest(space["loop"](factor * wanted.max())) < 0) == decays
