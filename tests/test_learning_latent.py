@@ -56,7 +56,9 @@ def reference(e: float, v: float, push: float, delay: int = 0) -> list[float]:
 def test_a_free_rollout_costs_the_error_of_the_differential_equation(push, delay):
     start, free, pushes = [[[0.003, -0.02]]], [[[False]]], [[[push]]]
     low = one_axis(delay)
-    loss = low.loss(torch.tensor(start), torch.tensor(free), torch.tensor(pushes))
+    loss = low.rollouts.cost(
+        low.actor, torch.tensor(start), torch.tensor(free), torch.tensor(pushes)
+    )
     errors = reference(0.003, -0.02, push, delay)
     assert loss.item() == pytest.approx(np.mean(np.abs(errors)) / 0.003, rel=1e-4)
 
@@ -65,7 +67,7 @@ def test_a_blocked_rollout_costs_the_force_beyond_the_limit():
     weight, limit = 0.3, 0.5
     low = one_axis(force_weight=weight, force_limit=limit)
     start = torch.tensor([[[0.004, 0.5]]])  # a blocked axis does not move, whatever the start says
-    loss = low.loss(start, torch.tensor([[[True]]]), torch.zeros(1, 1, 1))
+    loss = low.rollouts.cost(low.actor, start, torch.tensor([[[True]]]), torch.zeros(1, 1, 1))
     y = K1 * 0.004
     u = np.tanh(3.0 * y + 5.0 * TICK * y * np.arange(1, TICKS + 1))
     force = MASS * (K_P * 0.004 + ACTION * u)

@@ -13,7 +13,7 @@ The slope cap of the actor holds by construction, so learning cannot leave the s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -95,6 +95,63 @@ class LatentModel:
         return motion, push
 
 
+class Rollouts:
+    """Segments of the latent model under an actor, and what they cost.
+
+    Args:
+        model: the latent model of n axes.
+        horizon: ticks of a segment.
+        config: the loss.
+    """
+
+    def __init__(self, model: LatentModel, horizon: int, config: LatentConfig) -> None:
+        self.model, self.horizon, self.config = model, horizon, config
+        self._motion, self._push = (_tensor(part) for part in model.transition())
+        names = ("K_p", "K1", "K2", "action", "mass", "integrates")
+        self._constants = {name: _tensor(getattr(model, name)) for name in names}
+
+    def draw(self, generators: Sequence[np.random.Generator], batch: int) -> tuple[Tensor, Tensor]:
+        """Axes that are blocked, and constant pushes, (seeds, batch, n) each."""
+        shape, limit = (batch, len(self.model.K_p)), self.config.disturbance
+        blocked = np.stack([g.random(shape) for g in generators]) < self.config.blocked
+        blocked &= self.model.mass > 0
+        pushes = np.stack([g.uniform(-limit, limit, shape) for g in generators])
+        return torch.from_numpy(blocked), torch.from_numpy(pushes.astype(np.float32))
+
+    def cost(self, actor: nn.Module, starts: Tensor, blocked: Tensor, pushes: Tensor) -> Tensor:
+        """Mean cost of rollouts, (seeds,).
+
+        Args:
+            actor: maps (y, integral of y), (seeds, batch, 2n), to actions in [-1, 1].
+            starts: (e, e') of each segment, (seeds, batch, 2n).
+            blocked: axes that cannot move, (seeds, batch, n).
+            pushes: constant disturbance of each axis in units of an action, (seeds, batch, n).
+        """
+        c, config = self._constants, self.config
+        e, v = starts.chunk(2, dim=-1)
+        v = torch.where(blocked, 0.0, v)
+        free = (~blocked).to(e.dtype)
+        unit = torch.ones_like(c["K_p"])
+        unit[3:] = 1.0 / config.rotation_scale
+        size = (e * unit).norm(dim=-1, keepdim=True).clamp(min=1e-3)
+        integral, late = torch.zeros_like(e), [torch.zeros_like(e)] * self.model.delay
+        cost = torch.zeros(e.shape[:-1])
+        for _ in range(self.horizon):
+            y = c["K1"] * e + c["K2"] * v  # mapping_pos
+            integral = integral + self.model.tick * c["integrates"] * y
+            late.append(actor(torch.cat([y, integral], dim=-1)))
+            u = late.pop(0)
+            press = c["mass"] * (c["K_p"] * e + c["action"] * u).abs() * blocked
+            step = torch.einsum("...nj,nij->...ni", torch.stack([e, v], -1), self._motion)
+            step = step + self._push * (u + pushes)[..., None]
+            e = torch.where(blocked, e, step[..., 0])
+            v = torch.where(blocked, v, step[..., 1])
+            cost = cost + ((e * unit).abs() * free / size).sum(-1)
+            cost = cost + config.force_weight * (press - config.force_limit).clamp(min=0).sum(-1)
+            cost = cost + config.effort_weight * (u * u * free).sum(-1)
+        return cost.mean(-1) / self.horizon
+
+
 class LatentLow:
     """Learns an actor through the latent model, from the segment starts it has seen.
 
@@ -115,18 +172,12 @@ class LatentLow:
         config: LatentConfig,
     ) -> None:
         self.actor, self.model, self.horizon, self.config = actor, model, horizon, config
+        self.rollouts = Rollouts(model, horizon, config)
         self.adam = torch.optim.Adam(actor.parameters(), config.rate, foreach=True)
-        n = len(model.K_p)
-        self._starts = np.zeros((len(seeds), config.memory, 2 * n), dtype=np.float32)
+        self._n = len(model.K_p)
+        self._starts = np.zeros((len(seeds), config.memory, 2 * self._n), dtype=np.float32)
         self._written = 0
         self._generators = [np.random.default_rng([seed, 3, 17]) for seed in seeds]
-        motion, push = model.transition()
-        self._motion, self._push = _tensor(motion), _tensor(push)
-        self._constants = {
-            name: _tensor(value)
-            for name, value in asdict(model).items()
-            if name not in ("tick", "delay")
-        }
 
     def act(self, observation: Array, explore: bool) -> Array:
         """See `LowLevel.act`; nothing is explored, since the model is known."""
@@ -134,7 +185,7 @@ class LatentLow:
 
     def record(self, segment: Segment) -> None:
         """Keep the error and velocity with which each segment starts."""
-        n = len(self.model.K_p)
+        n = self._n
         starts = segment.observation[0][..., 2 * n : 4 * n].copy()  # error, velocity of the tip
         starts[..., n:] *= -1.0  # the sub-goal is at rest: e' = -velocity
         where = (self._written + np.arange(starts.shape[1])) % self.config.memory
@@ -142,54 +193,21 @@ class LatentLow:
         self._written += starts.shape[1]
 
     def update(self) -> None:
-        """One Adam step on the loss of a batch of rollouts."""
-        known = min(self._written, self.config.memory)
+        """One Adam step on the cost of a batch of rollouts."""
+        known, batch = min(self._written, self.config.memory), self.config.batch
         if not known:
             return
-        n, batch = len(self.model.K_p), self.config.batch
         drawn = np.stack([g.integers(known, size=batch) for g in self._generators])
-        starts = self._starts[np.arange(len(drawn))[:, None], drawn]
-        blocked = np.stack([g.random((batch, n)) for g in self._generators]) < self.config.blocked
-        blocked &= self.model.mass > 0
-        limit = self.config.disturbance
-        pushes = np.stack([g.uniform(-limit, limit, (batch, n)) for g in self._generators])
-        parts = (starts, blocked, pushes.astype(np.float32))
-        loss = self.loss(*(torch.from_numpy(part) for part in parts))
+        starts = torch.from_numpy(self._starts[np.arange(len(drawn))[:, None], drawn])
+        self.learn(starts, *self.rollouts.draw(self._generators, batch))
+
+    def learn(self, starts: Tensor, blocked: Tensor, pushes: Tensor) -> Tensor:
+        """One Adam step on the cost of given rollouts, which it returns, (seeds,)."""
+        cost = self.rollouts.cost(self.actor, starts, blocked, pushes)
         self.adam.zero_grad()
-        loss.sum().backward()
+        cost.sum().backward()
         self.adam.step()
-
-    def loss(self, starts: Tensor, blocked: Tensor, pushes: Tensor) -> Tensor:
-        """Mean cost of rollouts, (seeds,).
-
-        Args:
-            starts: (e, e') of each segment, (seeds, batch, 2n).
-            blocked: axes that cannot move, (seeds, batch, n).
-            pushes: constant disturbance of each axis in units of an action, (seeds, batch, n).
-        """
-        c, config = self._constants, self.config
-        e, v = starts.chunk(2, dim=-1)
-        v = torch.where(blocked, 0.0, v)
-        free = (~blocked).to(e.dtype)
-        unit = torch.ones_like(c["K_p"])
-        unit[3:] = 1.0 / config.rotation_scale
-        size = (e * unit).norm(dim=-1, keepdim=True).clamp(min=1e-3)
-        integral, late = torch.zeros_like(e), [torch.zeros_like(e)] * self.model.delay
-        cost = torch.zeros(e.shape[:-1])
-        for _ in range(self.horizon):
-            y = c["K1"] * e + c["K2"] * v  # mapping_pos
-            integral = integral + self.model.tick * c["integrates"] * y
-            late.append(self.actor(torch.cat([y, integral], dim=-1)))
-            u = late.pop(0)
-            press = c["mass"] * (c["K_p"] * e + c["action"] * u).abs() * blocked
-            step = torch.einsum("...nj,nij->...ni", torch.stack([e, v], -1), self._motion)
-            step = step + self._push * (u + pushes)[..., None]
-            e = torch.where(blocked, e, step[..., 0])
-            v = torch.where(blocked, v, step[..., 1])
-            cost = cost + ((e * unit).abs() * free / size).sum(-1)
-            cost = cost + config.force_weight * (press - config.force_limit).clamp(min=0).sum(-1)
-            cost = cost + config.effort_weight * (u * u * free).sum(-1)
-        return cost.mean(-1) / self.horizon
+        return cost.detach()
 
     def state(self) -> State:
         """Actor, Adam, starts, random streams."""

@@ -68,8 +68,13 @@ def jacobian_fault(plant: Any, low: Array, high: Array) -> str:
     """
     n, rng = plant.n, np.random.default_rng(0)
     centre, width = (high + low) / 2, high - low
-    u_low = np.asarray(getattr(plant, "u_low", -np.ones(n)), dtype=float)
-    u_high = np.asarray(getattr(plant, "u_high", np.ones(n)), dtype=float)
+    u_low, u_high = (
+        np.where(np.isfinite(u), u, fallback)
+        for u, fallback in (
+            (np.asarray(getattr(plant, "u_low", -np.inf), dtype=float) + np.zeros(n), -1.0),
+            (np.asarray(getattr(plant, "u_high", np.inf), dtype=float) + np.zeros(n), 1.0),
+        )
+    )
     y = rng.uniform(low, high, (_POINTS, n))
     u = rng.uniform(u_low, u_high, (_POINTS, n))
     y[0], u[0] = centre, (u_low + u_high) / 2

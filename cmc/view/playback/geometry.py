@@ -137,7 +137,8 @@ def site_mesh(model: mujoco.MjModel, site: int) -> tuple[mg.Mesh, Array]:
 
 def own_rgba(model: mujoco.MjModel, rgba: Array, material: int) -> Array:
     """The own color (4,), or the material's where that is the default."""
-    return model.mat_rgba[material] if material >= 0 and np.allclose(rgba, _DEFAULT_RGBA) else rgba
+    unset = material >= 0 and tuple(rgba) == _DEFAULT_RGBA
+    return model.mat_rgba[material] if unset else rgba
 
 
 def shown_rgba(model: mujoco.MjModel, rgba: Array, material: int) -> Rgba:
