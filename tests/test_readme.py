@@ -12,7 +12,7 @@ TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 
 
-@pytest.mark.parametrize("code", BLOCKS, ids=["theory", "sb3"])
+@pytest.mark.parametrize("code", BLOCKS, ids=["theory", "own plant", "sb3"])
 def test_code_runs(code: str) -> None:
     exec(compile(code, "README.md", "exec"), {})
 
