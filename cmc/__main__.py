@@ -87,6 +87,8 @@ def _parser() -> argparse.ArgumentParser:
     play.add_argument(
         "--out", type=Path, help="file (default play.png, or play.html for 3D; .npz keeps arrays)"
     )
+    play.add_argument("--live", action="store_true", help="a page in which the arm lives (3D)")
+    play.add_argument("--beside", metavar="METHOD", help="a second arm (--live); you set sub-goals")
     return parser
 
 
@@ -202,6 +204,9 @@ def _play(chosen: argparse.Namespace) -> None:
 
     study = registry.get(chosen.study)
     method = chosen.method or next(iter(study.methods))
+    if chosen.live or chosen.beside:
+        _live(study, method, chosen)
+        return
     if chosen.episode < 0:
         raise ValueError(f"--episode: wanted at least 0, got {chosen.episode}")
     seed = chosen.seed if study.method(method).trained else None
@@ -223,6 +228,25 @@ def _play(chosen: argparse.Namespace) -> None:
     else:
         (_page if out.suffix == ".html" else _picture)(motion, out)
     print(f"{motion['text']}\n{out}")
+
+
+def _live(study: Study, method: str, chosen: argparse.Namespace) -> None:
+    """A page with MuJoCo in it: one arm under its planner, or two that take the same sub-goals."""
+    from cmc.studies import live
+    from cmc.view.simulator import save_live_page
+    from cmc.view.style import METHOD_COLORS
+
+    first = [method] if chosen.beside is None else [method, chosen.beside]
+    names = [*first, *(name for name in live.playable(study) if name not in first)]
+    policies = live.live_policies(study, names)
+    for policy in policies:
+        policy["color"] = METHOD_COLORS[policy["name"]]
+    arms = [{"method": k, "kept": 0, "seed": chosen.seed} for k in range(len(first))]
+    title = " beside ".join(study.method(name).title for name in first)
+    out, task = chosen.out or Path("live.html"), live.live_task(study)
+    alone = chosen.beside is None
+    save_live_page(out, task, policies, title=f"{study.name}: {title}", arms=arms, plan=alone)
+    print(f"{study.name}: {title}\n{out}")
 
 
 def _picture(motion: dict[str, Any], out: Path) -> None:

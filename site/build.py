@@ -19,6 +19,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import cmc
 
@@ -26,6 +27,12 @@ ROOT = Path(__file__).resolve().parent.parent
 SITE = ROOT / "site"
 HIDDEN = {"exercises", "__main__"}
 """Rooms that are not imported by readers."""
+LIVE = {
+    "two_arms": ["peg_push", "--live", "--method", "ctd3", "--beside", "td3"],
+    "peg_maze": ["peg_maze", "--live"],
+    "peg_push": ["peg_push", "--live"],
+}
+"""Live pages and the commands that write them."""
 
 
 def main() -> int:
@@ -80,25 +87,53 @@ def execute(folder: Path, jobs: int) -> None:
 
 def live_pages(folder: Path) -> None:
     """The pages in which MuJoCo runs."""
-    from cmc.studies import live
+    from cmc.__main__ import main as command
 
     folder.mkdir(exist_ok=True)
-    for name in live.PAGES:
-        live.write(name, folder / f"{name}.html")
+    for name, arguments in LIVE.items():
+        if command(["play", *arguments, "--out", str(folder / f"{name}.html")]) != 0:
+            raise SystemExit(f"the live page {name} could not be written")
 
 
 def notation() -> str:
     """The table of symbols as a page."""
-    from cmc import notation as table
+    from cmc.notation import table
 
-    return f"# Notation\n\n{table.markdown()}\n"
+    return f"# Notation\n\n{table()}\n"
 
 
 def results() -> str:
-    """Every shipped table of results as a page."""
-    from cmc import results as shipped
+    """Last policies of every study, test by test, as a page of tables."""
+    from cmc.results import tidy
+    from cmc.studies import registry
 
-    return f"# All results\n\n{shipped.page()}\n"
+    parts = ["# All results", "", RESULTS, ""]
+    for name in registry.WHERE:
+        try:
+            data = tidy(name)
+        except (FileNotFoundError, ValueError):
+            continue  # a study without shipped tests
+        last = data[data["last"]] if "last" in data else data
+        numbers = last.select_dtypes("number").columns.difference(["seed", "step", "episode"])
+        keys = [key for key in ("title", "test") if key in last]
+        means = last.groupby(keys, sort=False)[list(numbers)].agg(["mean", "min", "max"])
+        parts += [f"## {name}", "", registry.get(name).about, ""]
+        for key in numbers:
+            table = means[key].dropna().reset_index()
+            parts += [f"### {name}: {key}", "", markdown(table), ""]
+        parts += [f"`{data.attrs.get('command', '')}`", ""]
+    return "\n".join(parts)
+
+
+RESULTS = """Every figure that is shipped, as means over seeds of the last policies, with the least
+and the largest seed. Columns and units are documented in `cmc.results`; `tidy(study)` gives rows."""
+
+
+def markdown(table: Any) -> str:
+    """A data frame as a Markdown table, numbers with four digits."""
+    rows = [list(table.columns), ["---"] * len(table.columns)]
+    rows += [[f"{v:.4g}" if isinstance(v, float) else str(v) for v in row] for row in table.values]
+    return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
 
 
 def api(folder: Path) -> str:

@@ -15,6 +15,20 @@ from cmc.studies.study import Study
 from cmc.studies.two_level import start_joints
 from cmc.studies.two_level_tests import TEST_SEED
 
+CHOICE = ("ctd3", "frozen", "td3_corrected", "control")
+"""Methods that a live page offers beside those it was asked for."""
+
+
+def playable(study: Study) -> list[str]:
+    """Shipped methods of `CHOICE`.
+
+    Raises:
+        ValueError: for a study without an arm.
+    """
+    if not hasattr(study.config, "task_class"):
+        raise ValueError(f"{study.name} has no arm to play live; wanted peg_maze or peg_push")
+    return [name for name in CHOICE if name in study.methods and find(study, name).is_file()]
+
 
 def live_task(study: Study, starts: int = 5) -> dict[str, Any]:
     """Scene, control law, limits and test starts of a study's task; SI units throughout."""
@@ -74,6 +88,8 @@ def live_policies(
     found = []
     for name in methods:
         kept = []
+        if study.config_of(name).task.command != "pose":
+            raise ValueError(f"{name} moves joints; a live page plays methods that move the tip")
         marks = marks_of(store.load_checkpoint(find(study, name))[0])
         for step in marks[-1:] if steps is None else [m for m in marks if m in steps][-3:]:
             loaded = load(study, name, step)
