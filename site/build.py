@@ -126,7 +126,7 @@ def results() -> str:
 
 
 RESULTS = """Every figure that is shipped, as means over seeds of the last policies, with the least
-and the largest seed. Columns and units are documented in `cmc.results`; `tidy(study)` gives rows."""
+and the largest seed. `cmc.results` documents columns and units; `tidy(study)` gives the rows."""
 
 
 def markdown(table: Any) -> str:
