@@ -127,13 +127,14 @@ def test_the_turning_plant_follows_the_recipe_and_leaves_its_goal(whole):
     recipe = turning.space(y, turning.hold(y))
     cos, sin = np.cos(3 * y[:, 0]), np.sin(3 * y[:, 0])
     rot = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], -2)
-    np.testing.assert_allclose(recipe.T_a, rot, atol=1e-9)
+    np.testing.assert_allclose(recipe.T_a, rot, atol=1e-6)
     u, step = np.array([0.3, -1.0]), 1e-6
     numeric = [(turning.f(y + d, u) - turning.f(y - d, u)) / (2 * step) for d in step * np.eye(2)]
-    np.testing.assert_allclose(turning.f_y(y, u), np.stack(numeric, -1), atol=1e-8)
+    np.testing.assert_allclose(turning.f_y(y, u), np.stack(numeric, -1), atol=1e-7)
     assert np.linalg.eigvals(space["J_frozen"]).real.max() < 0  # at the goal
     assert "exact  linearization at the goal: largest real part +13.34" in whole.text
-    assert space["promise"].holds
+    assert not space["promise"]  # a frozen answer proves nothing here
+    assert space["promise"].rate > 0
     assert space["apart"][-1].min() > 50 * space["apart"][0].min()
 
 
