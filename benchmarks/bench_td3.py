@@ -22,9 +22,9 @@ import torch
 from torch import nn
 
 from cmc.learning.td3 import TD3, Replay, TD3Config
-from cmc.studies.old import peg_maze, peg_push
-from cmc.studies.old.two_level import TwoLevelStudy
-from cmc.studies.old.two_level_parts import Planner, build
+from cmc.policies import DirectPolicy, JointNetwork
+from cmc.studies import peg_maze, peg_push
+from cmc.studies.study import Study
 
 PAPER, SMALL = (400, 300), (128, 128)
 ROWS, BATCH, PERIOD = 65_536, 128, 2
@@ -39,8 +39,8 @@ Call = Callable[[], object]
 
 def _sizes() -> tuple[int, int]:
     """Sizes of what the planner of peg push sees and does."""
-    study, planning = peg_push.STUDY, peg_push.STUDY.planning()
-    task = study.task_class(study.task, num=1)
+    config, planning = peg_push.STUDY.config, peg_push.STUDY.config.planning()
+    task = config.make(1)
     return planning.observe(task, task.reset()).shape[-1], len(planning.low)
 
 
@@ -59,7 +59,9 @@ def _ours(data: list[np.ndarray], hidden: tuple[int, ...], seeds: int) -> Call:
     tiled = [np.broadcast_to(part, (seeds, *part.shape)) for part in data]
     replay.add(*tiled, np.ones((seeds, ROWS)))  # type: ignore[call-arg]
     config = TD3Config(critic_hidden=hidden, batch=BATCH, actor_period=PERIOD, target_period=PERIOD)
-    agent = TD3(Planner(inputs, outputs, hidden, numbers), numbers, inputs, outputs, config)
+    network = JointNetwork(outputs, inputs=inputs, hidden=hidden, seeds=numbers, last=1.0)
+    actor = DirectPolicy(network, squash=True)
+    agent = TD3(actor, numbers, inputs, outputs, config)
     return lambda: agent.update(replay.sample(BATCH))
 
 
@@ -141,14 +143,15 @@ def _interleaved(runs: dict[str, Callable[[int], object]], count: int) -> dict[s
     return spent
 
 
-def _trainer(study: TwoLevelStudy, method: str) -> Any:
+def _trainer(study: Study, method: str) -> Any:
     """Five seeds of a training, just past its warm-up, with all updates on."""
+    config = study.config
     short = replace(
-        study,
-        hierarchy=replace(study.hierarchy, warm_up=FIRST),
-        low=replace(study.low, critic_head_start=0),
+        config,
+        hierarchy=replace(config.hierarchy, warm_up=FIRST),
+        low=replace(config.low, critic_head_start=0),
     )
-    trainer = build(short, method, list(range(SEEDS)))
+    trainer: Any = replace(study, config=short).build(method, list(range(SEEDS)))
     while trainer.steps < FIRST + trainer.stride:
         trainer.segment()
     return trainer
