@@ -9,8 +9,10 @@ import pytest
 import torch
 
 from cmc.learning.hierarchy import HierarchyConfig, play
-from cmc.studies.old import peg_maze, peg_push
-from cmc.studies.old.two_level_parts import build
+from cmc.studies import peg_maze, peg_push
+from cmc.studies.two_level_arms import frozen, latent, two_level
+
+MAZE, PUSH = peg_maze.STUDY.config, peg_push.STUDY.config
 
 
 def test_exploration_falls_linearly_and_stays():
@@ -39,19 +41,19 @@ def test_the_low_level_learns_from_the_start_and_the_planner_after_the_warm_up()
     assert config.updates(300) == (100, 90)
 
 
-def planner(study, worlds=400):
+def planner(config, worlds=400):
     """A training whose planner asks for the middle of its range, and what it sees."""
-    study = replace(study, hierarchy=replace(study.hierarchy, worlds=worlds))
-    trainer = build(study, "frozen", [0])
+    config = replace(config, hierarchy=replace(config.hierarchy, worlds=worlds))
+    trainer = two_level(frozen)(config, [0])
     for parameter in trainer.planner.actor.parameters():
         torch.nn.init.zeros_(parameter)
-    return trainer, study.planning().observe(trainer.task, trainer.task.reset())[None]
+    return trainer, config.planning().observe(trainer.task, trainer.task.reset())[None]
 
 
 @pytest.mark.parametrize("steps", [10_000, 500_000])
 def test_sub_goals_scatter_by_the_noise_of_the_moment(steps):
-    calm = replace(peg_push.STUDY.hierarchy, redraw=(0.0, 0.0), burst=(0.0, 0.0))
-    trainer, seen = planner(replace(peg_push.STUDY, hierarchy=calm))
+    calm = replace(PUSH.hierarchy, redraw=(0.0, 0.0), burst=(0.0, 0.0))
+    trainer, seen = planner(replace(PUSH, hierarchy=calm))
     trainer.steps = steps
     action = trainer._choose(seen, np.zeros(()))
     assert np.std(action) == pytest.approx(calm.exploration(steps)[0], rel=0.1)
@@ -59,13 +61,13 @@ def test_sub_goals_scatter_by_the_noise_of_the_moment(steps):
 
 def test_redraws_and_bursts_come_as_often_as_asked_and_bursts_last():
     rates = replace(
-        peg_push.STUDY.hierarchy,
+        PUSH.hierarchy,
         high_noise=0.0,
         high_noise_end=0.0,
         redraw=(0.1, 0.1),
         burst=(0.05, 0.05),
     )
-    trainer, seen = planner(replace(peg_push.STUDY, hierarchy=rates))
+    trainer, seen = planner(replace(PUSH, hierarchy=rates))
     trainer.steps = 10_000
     drawn = np.array([trainer._choose(seen, np.zeros(()))[0] != 0 for _ in range(60)])
     whole = drawn.all(-1)  # (60, worlds): in a burst, or by six redraws of one in ten
@@ -77,11 +79,10 @@ def test_redraws_and_bursts_come_as_often_as_asked_and_bursts_last():
         assert whole[k + 1 : k + 4, world].all()
 
 
-@pytest.mark.parametrize("study", [peg_push.STUDY, peg_maze.STUDY], ids=lambda s: s.name)
-def test_critics_see_tip_and_sub_goal_from_the_goal(study):
-    study = replace(study, relative=True)
-    trainer, _ = planner(study, worlds=3)
-    task, planning = trainer.task, study.planning()
+@pytest.mark.parametrize("config", [PUSH, MAZE], ids=["push", "maze"])
+def test_critics_see_tip_and_sub_goal_from_the_goal(config):
+    trainer, _ = planner(config, worlds=3)
+    task, planning = trainer.task, config.planning()
     action = np.random.default_rng(0).uniform(-0.3, 0.3, (3, len(planning.low)))
     obs = task.reset()
     seen = torch.as_tensor(planning.observe(task, obs), dtype=torch.float32)
@@ -96,11 +97,11 @@ def test_critics_see_tip_and_sub_goal_from_the_goal(study):
 
 
 def test_play_keeps_what_a_loop_by_hand_sees():
-    study = replace(peg_maze.STUDY, task=replace(peg_maze.STUDY.task, ticks=40))
-    trainer = build(study, "ctd3", [0, 1])
-    planner, planning = trainer.planner.actor, study.planning()
+    config = replace(MAZE, task=replace(MAZE.task, ticks=40))
+    trainer = two_level(latent)(config, [0, 1])
+    planner, planning = trainer.planner.actor, config.planning()
     names = ("reward", "tip", "success", "distance", "target")
-    task, other = (study.task_class(study.task, num=4, seed=5) for _ in range(2))
+    task, other = config.make(4, 5), config.make(4, 5)
     kept = play(task, planning, planner, trainer.low, 2, names)
     obs, rows = other.reset(), []
     for tick in range(40):

@@ -25,7 +25,7 @@ from cmc.learning.hiro import (
 from cmc.learning.low_level import Segment, evaluate
 from cmc.learning.td3 import TD3, Batch, TD3Config
 from cmc.robot.panda import FINGERTIP, forward_kinematics
-from cmc.studies.old import peg_maze
+from cmc.studies import peg_maze
 
 N, T = 2, 5
 FREE = (torch.full((N,), -9.0), torch.full((N,), 9.0))
@@ -200,12 +200,12 @@ def test_a_frozen_actor_answers_as_the_learner_without_noise() -> None:
 
 def test_the_first_random_sub_goals_lie_around_the_maze() -> None:
     """Their middle moves the joints to a pose with the tip among the goals."""
-    study = peg_maze.STUDY.of("hiro")
-    planning, task = study.planning(), PegMaze(study.task, num=3, seed=0)
+    config = peg_maze.STUDY.config_of("hiro")
+    planning, task = config.planning(), PegMaze(config.task, num=3, seed=0)
     obs = task.reset()
     task.set_subgoal(planning.subgoal(planning.direction(task, obs)))
     np.testing.assert_allclose(task.target_joints, np.tile(planning.aim, (3, 1)), atol=1e-9)
-    tip, _ = forward_kinematics(planning.aim, tool=FINGERTIP + study.task.peg.length)
+    tip, _ = forward_kinematics(planning.aim, tool=FINGERTIP + config.task.peg.length)
     assert (tip >= GOAL_LOW).all()
     assert (tip <= GOAL_HIGH).all()
-    assert not peg_maze.STUDY.planning().direction(task, obs).any()
+    assert not peg_maze.STUDY.config.planning().direction(task, obs).any()

@@ -12,8 +12,8 @@ from torch import nn
 
 from cmc.learning.latent import LatentConfig, LatentLow, LatentModel
 from cmc.learning.low_level import Segment
-from cmc.studies.old import peg_push
-from cmc.studies.old.two_level_parts import build_low
+from cmc.studies import peg_push
+from cmc.studies.two_level_arms import latent
 
 K_P, K_D, K1, K2, ACTION, MASS, TICK, TICKS = 20.0, 30.0, 29.0, 0.7, 0.8, 3.0, 0.02, 20
 
@@ -81,9 +81,11 @@ def test_without_starts_nothing_is_learned():
     assert low.actor.gain.tolist() == [3.0, 5.0]
 
 
-def trained(study, updates: int, **options) -> LatentLow:
-    study = replace(study, latent=replace(study.latent, batch=32, **options))
-    low = build_low(study, "ctd3", [0])
+CONFIG = peg_push.STUDY.config_of("ctd3")
+
+
+def trained(config, updates: int, **options) -> LatentLow:
+    low = latent(replace(config, latent=replace(config.latent, batch=32, **options)), [0])
     rng = np.random.default_rng(0)
     observation = np.zeros((1, 1, 512, 25))
     observation[0, ..., 12:18] = rng.uniform(-1, 1, (512, 6)) * np.repeat([0.005, 0.3], 3)
@@ -102,10 +104,10 @@ def slopes(low: LatentLow, offset: int) -> np.ndarray:
 
 
 def test_pure_tracking_goes_to_the_cap_and_the_integral_needs_a_push():
-    study = replace(peg_push.STUDY, start_gain=20.0)  # both ways from a large start
-    cap = study.slope_cap("ctd3")[:3]
-    alone = trained(study, 200, force_weight=0.0, disturbance=0.0)
-    pushed = trained(study, 200, force_weight=0.0, disturbance=0.5)
+    config = replace(CONFIG, start_gain=20.0)  # both ways from a large start
+    cap = config.slope_cap()[:3]
+    alone = trained(config, 200, force_weight=0.0, disturbance=0.0)
+    pushed = trained(config, 200, force_weight=0.0, disturbance=0.5)
     assert np.all(slopes(alone, 0) > 0.95 * cap)
     for low in (alone, pushed):
         assert np.all(slopes(low, 0) <= cap * (1 + 1e-4))
@@ -113,7 +115,7 @@ def test_pure_tracking_goes_to_the_cap_and_the_integral_needs_a_push():
 
 
 def test_a_price_on_force_lowers_the_slope_of_heavy_axes():
-    low = trained(peg_push.STUDY, 200, force_weight=1.0)
+    low = trained(CONFIG, 200, force_weight=1.0)
     x, y, z = slopes(low, 0)
     assert z < y < x  # in the order of the masses
-    assert z < 0.5 * peg_push.STUDY.slope_cap("ctd3")[2]
+    assert z < 0.5 * CONFIG.slope_cap()[2]
