@@ -1,5 +1,0 @@
-"""Old name of `cmc.learning.td3`."""
-
-from cmc.learning.td3 import Batch, Replay
-
-__all__ = ["Batch", "Replay"]
