@@ -1,234 +1,175 @@
-"""Lesson 12: the model and the episodes, against independent references."""
+"""Lesson 12: its cells against the simulator and the library, the two plans, the failures."""
 
 import numpy as np
 import pytest
+import torch
+from lesson import lesson
 
-from cmc import store
-from cmc.envs.peg_push import BOX_TOP, PUSH, TARGET
-from cmc.lessons import lesson_12, lesson_12_critic, lesson_12_episodes
-from cmc.studies.old import peg_push, two_level_training
+from cmc import exercises
+from cmc.learning.low_level import CriticLow, Segment
 
-# -- one sub-goal, one plan ----------------------------------------------------------------------
-
-
-def test_the_gains_alone_cover_a_fifth_of_a_step_and_a_gain_all_of_it():
-    """Reference: the closed solution of e'' + K_d e' + K_p e = 0 from rest."""
-    step = lesson_12.one_step((0.0, 20.0, 150.0))
-    p, q = np.roots([1.0, 30.0, 20.0]).real
-    t = step["t"]
-    exact = 1.0 - (p * np.exp(q * t) - q * np.exp(p * t)) / (p - q)
-    np.testing.assert_allclose(step["share"][:, 0], exact, atol=0.02)
-    assert step["share"][-1, 1] > 0.95
-    swing = np.abs(np.diff(step["u"][-6:], axis=0)).max(0)
-    assert swing[1] < 0.1 < 1.0 < swing[2]  # beyond the bound the command chatters
+HERE = lesson("12")
+HERE |= {"FITS": 300, "SAMPLES": 3000, "STARTS": 1, "LENGTH": 100, "TESTS": 2}
+PLAN = [(9.5, 4), (9.5, -3), (-5.1, -3), (3, -3), (3, -12.5), (0, -12.5)]
 
 
-@pytest.mark.parametrize("gain", [0.0, 2.0, 20.0])
-def test_slider_agrees_with_the_arm(gain):
-    arm, model = lesson_12.one_step((gain,)), lesson_12.segment(gain)
-    np.testing.assert_allclose(model["share"][:21], 100 * arm["share"][:, 0], atol=2.5)
+@pytest.fixture(scope="module")
+def ways():
+    return {g: HERE["follow"](PLAN, g) for g in (0.0, 20.0)}
 
 
-def test_slider_says_when_a_command_chatters():
-    K2 = peg_push.STUDY.task.gains.latent.K2[0]
-    for level, words in ((1.0, ("calm", "swings")), (2.0, ("swings", "chatters"))):
-        edge = (level / PUSH.tick - 30.0) / K2
-        for part, word in zip((0.98, 1.02), words, strict=True):
-            assert word in lesson_12.segment(part * edge)["text"]
-    tail = [np.diff(np.sign(lesson_12.segment(g, integral=False)["u"])) for g in (20.0, 150.0)]
-    assert not tail[0].any()
-    assert np.abs(tail[1][20:]).sum() > 20  # every other tick another sign
-    assert lesson_12.level(lesson_12.CAP) == pytest.approx(peg_push.STUDY.latent.cap)
-    assert lesson_12.segment(2.0, ticks=50)["due"] == pytest.approx(1000.0)
-    more, less = (lesson_12.segment(2.0, integral=i)["share"][20] for i in (True, False))
-    assert more > less
+def test_the_plan_needs_a_low_level(ways):
+    assert not ways[0.0]["success"].any()
+    assert ways[20.0]["success"][-1]
+    assert ways[20.0]["reward"].sum() == pytest.approx(-97, abs=1)  # exercise 3 asks for better
+    assert ways[0.0]["reward"].sum() < 3 * ways[20.0]["reward"].sum()
 
 
-def test_the_plan_succeeds_with_a_low_level_and_not_without():
-    run = lesson_12.plan((0.0, 20.0))
-    assert run["success"].tolist() == [False, True]
-    assert run["total"][1] > -400 > run["total"][0]
-    np.testing.assert_allclose(run["distance"], np.linalg.norm(TARGET - run["tip"], axis=-1))
+def test_without_a_low_level_a_fifth_of_a_step_is_covered():
+    assert 18 < HERE["segment"](0.0, 20, True)["share"][20] < 25
 
 
-def test_live_training_reports_both_arms():
-    seen = []
-    run = lesson_12.live_training(lambda *row: seen.append(row), steps=320, warm_up=160)
-    assert run["step"].tolist() == [160, 320]
-    assert len(seen) == 2
-    assert seen[-1][0] == 320
-    for name in ("ctd3", "control"):
-        assert run[name].shape == (2,)
-        assert ((run[name] < 0) & (run[name] > -1200)).all()
-    assert "far too short" in lesson_12.live_sentence(run)
+def test_the_slider_names_what_happens():
+    for gain, word in ((20.0, "calm"), (60.0, "swings"), (120.0, "chatters")):
+        assert word in HERE["segment"](gain, 20, True)["title"]
 
 
-# -- what a critic can know ----------------------------------------------------------------------
+def test_the_discount_decides_between_the_two_plans():
+    OPEN = HERE["OPEN"]
+    starts = {
+        "from above the slot": (OPEN, 260, [(3, -8), (3, -12.5), (0, -12.5)]),
+        "from the obstacle": ([*OPEN, (0, -11)], 380, [(3, -9.5), (3, -12.5), (0, -12.5)]),
+    }
+    for parts in starts.values():
+        both = HERE["two_plans"](*parts)
+        assert both["push"]["success"][-1]
+        assert not both["stand"]["success"].any()
+        top = 1e3 * np.linalg.norm(both["stand"]["tip"][-1] - HERE["BOX_TOP"] + [0, 0, 0.0125])
+        assert top == pytest.approx(1.5, abs=0.1)  # 1.5 mm above the target
+        better = both["push"]["segments"] - both["stand"]["segments"]
+        value = {g: (g ** np.arange(len(better)) * better).sum() for g in (0.5, 0.9)}
+        assert value[0.5] < 0 < value[0.9]
 
 
-def test_twins_look_alike_and_want_opposite_actions():
-    twin = lesson_12_critic.twins()
-    assert np.abs(twin["y"]).max() < 1e-12
-    np.testing.assert_allclose(twin["e"][0], [1.0, -1.0])
-    np.testing.assert_allclose(twin["value"][0], twin["value"][1])
-    assert twin["slope"][0] == pytest.approx(-twin["slope"][1])
-    assert twin["slope"][0] > 0.5
+def test_the_segments_return_is_what_the_corrected_critic_stores(monkeypatch):
+    """The library sums the same rewards from each tick to the end of the segment."""
+    rewards = -np.random.default_rng(0).random((20, 1, 3))
+    stored = {}
+
+    class Memory:
+        def add(self, *parts):
+            stored["return"] = parts[2]
+
+    low = object.__new__(CriticLow)
+    low.replay, low.size, low.whole_return = Memory(), 25, True
+    low.weights = {"translation": 1.0}
+    seen, action = np.zeros((21, 1, 3, 25)), np.zeros((20, 1, 3, 6))
+    low.record(Segment(seen, action, {"translation": rewards}, np.zeros((20, 1, 3))))
+    solution = exercises.check("12-segment-return", own_return)
+    assert solution
+    wanted = np.stack([own_return(rewards[:, 0, k], 20) for k in range(3)], axis=1)
+    np.testing.assert_allclose(np.sort(stored["return"].ravel()), np.sort(wanted.ravel()))
 
 
-def test_the_model_is_the_differential_equation():
-    """One tick, against a fine integration of e'' = -K_d e' - K_p e - u."""
-    rng = np.random.default_rng(0)
-    e, v, u = rng.normal(size=(3, 4, 6))
-    latent, small = peg_push.STUDY.task.gains.latent, PUSH.tick / 20_000
-    x, w = e.copy(), v.copy()
-    for _ in range(20_000):
-        x, w = x + small * w, w - small * (latent.K_d * w + latent.K_p * x + u)
-    found = lesson_12_critic.advance(e, v, u)
-    np.testing.assert_allclose(found, (x, w), atol=2e-4)
+def own_return(rewards, horizon):
+    return np.reshape(rewards, (-1, horizon))[:, ::-1].cumsum(1)[:, ::-1].ravel()
 
 
-def test_action_slope_is_the_change_of_the_return():
-    """Far from zero error the return is -sum of e: its slope is the impulse response, summed."""
-    e, v = np.zeros((1, 6)), np.zeros((1, 6))
-    e[0, 0] = 1.0  # so large that e stays positive; u = 0
-    slope = lesson_12_critic.action_slope(lambda seen: np.zeros(seen[..., :6].shape), e, v)
-    path, rate, total = 0.0, 0.0, 0.0
-    small, steps = PUSH.tick / 1000, 1000
-    for k in range(PUSH.horizon):
-        for _ in range(steps):
-            path, rate = (
-                path + small * rate,
-                rate - small * (30.0 * rate + 20.0 * path + float(k == 0)),
-            )
-        total += path
-    assert slope[0, 0] == pytest.approx(-total, rel=0.01)
-    np.testing.assert_allclose(slope[0, 1:], 0.0, atol=1e-9)
+def test_the_models_return_is_the_simulators_in_free_space():
+    """A step of 5 mm along x under u = tanh(20 (y + integral)): the same sum of errors."""
+    from dataclasses import replace
+
+    still = replace(HERE["PUSH"], scene="panda.xml", start_box=(0.0,) * 3)
+    task = HERE["PegPush"](still, num=1, seed=0)
+    obs = task.reset()
+    start = obs[0, task.layout["position"]].copy()
+    obs, total = task.set_subgoal(np.array([[0.005, 0, 0, 0, 0, 0]])), 0.0
+    first = None
+    for _ in range(20):
+        y, integral = (obs[:, task.layout[name]] for name in ("latent", "integral"))
+        u = np.tanh(20.0 * (y + integral))
+        first = u[0, 0] if first is None else first
+        obs, *_ = task.step(u)
+        total -= 1e3 * abs(start[0] + 0.005 - obs[0, task.layout["position"]][0])
+    one = np.array([0.005])
+    found = HERE["segment_return"](one, 0 * one, 0 * one, 0 * one, np.array([first]))
+    assert found[0] == pytest.approx(total, rel=0.1)
 
 
-def test_plane_is_odd_in_the_effect_and_even_in_the_return():
-    plane = lesson_12_critic.plane(21)
-    np.testing.assert_allclose(plane["value"], plane["value"][::-1, ::-1])
-    np.testing.assert_allclose(plane["gain"], -plane["gain"][::-1, ::-1], atol=1e-9)
-    line = np.abs(plane["v"][:, None] - plane["y_zero"][None]) < 8.0
-    assert np.ptp(plane["value"][line]) > 0.05 * np.ptp(plane["value"])
+def test_twins_need_opposite_actions():
+    L = HERE["L"]
+    e = np.array([1e-3, -1e-3])
+    slope = HERE["effect"](e, -L.K1[0] / L.K2[0] * e, 0 * e, 0, 0 * e)
+    assert slope[0] > 1 > -1 > slope[1]
+    np.testing.assert_allclose(slope[0], -slope[1])
 
 
-def test_three_ways_train_and_only_the_model_needs_no_critic():
-    found = lesson_12_critic.three_ways(segments=4, seeds=(0,))
-    for name in lesson_12_critic.WAYS:
-        way = found[name]
-        assert way["covered"].shape == way["offset"].shape == (found["ticks"].size, 1)
-        assert ("agreement" in way) == (name != "ctd3")
-        if name != "ctd3":
-            assert 0.0 <= way["agreement"][0] <= 1.0
-    assert (found["ctd3"]["slope"] <= lesson_12.CAP).all()
-    assert (found["ctd3"]["covered"] > 0.8).all()
-    assert (found["ctd3"]["offset"] < 1e-6).all()  # odd by construction
-    assert lesson_12_critic.ways_table(found).count("\n| ") == len(lesson_12_critic.WAYS) + 1
+def test_no_action_matters_with_no_time_to_go():
+    early, late = (HERE["effect"](*(np.array([x]) for x in (0.003, 0.0, 0.0, k, 0.0)))[0]
+                   for k in (0, 19))  # fmt: skip
+    assert abs(late) < 0.1 * abs(early)
 
 
-def test_agreement_counts_signs(monkeypatch):
-    """A critic that is the truth agrees everywhere, its opposite nowhere."""
-    low = lesson_12_critic.build_low(peg_push.STUDY, "td3_corrected", [0])
-    e = np.random.default_rng(0).uniform(-0.005, 0.005, (1, 4, 6))
-    segment, _ = lesson_12_critic._segment(low, e, np.zeros_like(e))
-
-    def along(sign):
-        def values(critics, seen, u):  # u should push along y where the tip hardly moves
-            return (sign * u[..., :3] * seen[..., 12:15]).sum(-1)[:, None]
-
-        return values
-
-    shares = []
-    for sign in (1.0, -1.0):
-        monkeypatch.setattr(low.agent, "values", along(sign))
-        shares.append(lesson_12_critic.agreement(low, segment)[0])
-    assert shares[0] + shares[1] == pytest.approx(1.0)
-    assert shares[0] > 0.8
+def test_a_critic_that_sees_more_has_more_right_signs():
+    known, fresh = HERE["draw"](3000, 0), HERE["draw"](800, 1)
+    truth, right = HERE["effect"](*fresh), {}
+    for corrected in (False, True):
+        returns = HERE["segment_return"](*known)
+        critic = HERE["fit"](HERE["seen"](*known, corrected), returns, steps=600)
+        found = critic(HERE["seen"](*fresh, corrected))
+        right[corrected] = (np.sign(found) == np.sign(truth))[np.abs(truth) > 0.1].mean()
+    assert right[False] < 0.75 < 0.9 < right[True]
 
 
-# -- how episodes end ----------------------------------------------------------------------------
+def test_the_shipped_half_way_training_goes_on():
+    trainer = HERE["take_up"]()
+    steps, written = trainer.steps, len(trainer.replay)
+    assert 100_000 < steps < 480_000
+    assert written == steps // 20  # one row for each segment of each world
+    before = trainer.planner.actor.network.mlp.weights[0].detach().clone()
+    trainer.segment()
+    assert trainer.steps == steps + 160
+    assert not torch.equal(before, trainer.planner.actor.network.mlp.weights[0])
 
 
 @pytest.mark.parametrize(
-    ("tip", "lid", "obstacle", "kind"),
+    ("tip", "lid", "obstacle", "end"),
     [
-        ((0, 0, -12.5), -12, (0, -3), lesson_12_episodes.REACHED),
-        ((0, 11, 4), 0, (0, 0), "never came down"),
-        ((0, 1, 0.05), 0, (0, 0), "stands on the lid"),
-        ((0, 10, -3.9), 0, (0, 0), "lid not open"),
-        ((5, 0, -3.9), -12, (0, 0), "beside the slot"),
-        ((0, 0, -11.0), -12, (0, 0), "obstacle not moved"),
-        ((0, 3, -12.6), -12, (0, 0), "at the bottom, beside the target"),
-        ((0, 4, -8.0), -12, (0, 0), "in the slot, not at its bottom"),
+        ((0, 0, -12.5), -11, (0, -3), "at the bottom, beside the target"),
+        ((41, 3, -14), -11, (0, -3), "outside the box"),
+        ((3, -97, -12), -11, (0, -3), "outside the box"),
+        ((0, 0.2, -11.0), -11, (0, 0), "on the obstacle"),
+        ((0, 4.0, -9), -11, (0, 0), "in the slot"),
+        ((0.5, 1.0, 0.1), 0, (0, 0), "on the lid"),
+        ((0, 11, 6), 0, (0, 0), "above the box"),
+        ((0, 7.5, -3.9), -1.0, (0, 0), "lid not open"),
+        ((5, 1, -3.9), -11.0, (0, 0), "beside the slot"),
     ],
 )
-def test_ends_are_named_by_where_things_are(tip, lid, obstacle, kind):
-    found = lesson_12_episodes.classify(
-        np.array(tip, float),
-        lid,
-        np.array(obstacle, float),
-        success=kind == lesson_12_episodes.REACHED,
-        touched=False,
-        penetration=0.05,
-    )
-    assert found == kind
+def test_failures_are_named_in_three_coordinates(tip, lid, obstacle, end):
+    assert HERE["classify"](tip, lid, obstacle, False, False, 0.1) == end
+    assert HERE["classify"](tip, lid, obstacle, True, True, 0.1) == "touches at the end"
+    assert HERE["classify"](tip, lid, obstacle, False, True, 0.1) == "touched, then left"
+    assert HERE["classify"](tip, lid, obstacle, True, True, 0.3) == "pressed through"
 
 
-def test_history_comes_before_place():
-    place = (np.array([0.0, 0.0, -12.5]), -12.0, np.array([0.0, -3.0]))
-    past = {"success": False, "touched": True, "penetration": 0.1}
-    assert lesson_12_episodes.classify(*place, **past) == "touched, then left"
-    past |= {"success": True, "penetration": 0.3}
-    assert lesson_12_episodes.classify(*place, **past) == "pressed through"
+def test_shipped_episodes_are_sorted():
+    run = HERE["episodes"]("control")
+    assert len(run["ends"]) == run["tip"].shape[1] > 0
+    assert run["qpos"].shape[:2] == run["tip"].shape[:2]
 
 
-@pytest.fixture
-def policies(tmp_path, monkeypatch):
-    """Barely trained policies of two methods in place of the shipped ones."""
-    for name in ("frozen", "control"):
-        two_level_training.train(peg_push.STUDY, name, [0, 1], steps=160, out=tmp_path)
-    asset = store.asset
-
-    def find(*parts):
-        if parts[0] != "checkpoints":
-            return asset(*parts)
-        if not (tmp_path / parts[1]).is_file():
-            raise FileNotFoundError(parts[1])
-        return tmp_path / parts[1]
-
-    monkeypatch.setattr(store, "asset", find)
-    monkeypatch.setenv("CMC_FAST", "1")
-    lesson_12_episodes.episodes.cache_clear()
-    yield tmp_path
-    lesson_12_episodes.episodes.cache_clear()
-
-
-def test_episodes_are_those_of_the_study(policies):
-    assert lesson_12_episodes.shipped() == ["frozen", "control"]
-    run = lesson_12_episodes.episodes("frozen", None, 2)
-    motion = peg_push.motion("frozen", 1, episode=1)
-    np.testing.assert_allclose(run["qpos"][:, 3], motion["qpos"][: len(run["t"])], atol=1e-9)
-    np.testing.assert_allclose(run["distance"][:, 3], motion["distance"][: len(run["t"])])
-    out = lesson_12_episodes.distances("control", 10)
-    assert out["distance"].shape == (len(out["t"]), 2)
-    assert "step 160 " in out["text"]
-
-
-def test_tables_and_gallery_of_failures(policies):
-    table = lesson_12_episodes.failure_table(starts=2)
-    rows = [row.split("|")[1:-1] for row in table.splitlines()[2:]]
-    assert [row[0].strip() for row in rows] == ["TD3/frozen random C", "TD3/Control"]
-    for row in rows:
-        assert sum(int(cell) for cell in row[2:]) == int(row[1]) == 4
-    cases = lesson_12_episodes.gallery(failures=3, starts=2)
-    assert len(cases) == 3
-    kinds = set(
-        lesson_12_episodes.verdicts(lesson_12_episodes.episodes("frozen", None, 2))
-        + lesson_12_episodes.verdicts(lesson_12_episodes.episodes("control", None, 2))
-    )
-    assert len({case["kind"] for case in cases}) == min(len(kinds), 3)
-    for case in cases:
-        assert case["qpos"].shape[0] == case["t"].size == case["tip"].shape[0]
-        np.testing.assert_allclose(case["tip"][0], BOX_TOP, atol=0.02)
-    assert lesson_12_episodes.rest_table().count("\n| ") == 1  # control has no low level
+@pytest.mark.parametrize(
+    ("name", "wrong", "message"),
+    [
+        ("12-segment-return", lambda r, h: np.cumsum(r[::-1])[::-1], "last tick of every segment"),
+        ("12-segment-return", lambda r, h: None, "None"),
+        ("12-discount", lambda push, stand: 0.99, "smallest discount"),
+        ("12-plan", lambda: [(9.5, 4), (0, -12.5)], "no strict touch"),
+        ("12-plan", lambda: PLAN, "wanted above -90"),
+    ],
+)
+def test_exercises_name_the_slip(name, wrong, message):
+    verdict = exercises.check(name, wrong)
+    assert not verdict
+    assert message in repr(verdict)

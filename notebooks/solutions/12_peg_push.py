@@ -18,5 +18,5 @@ def my_discount(push, stand):
 
 
 def my_plan():
-    """Straight down beside the lid, push it open no farther than needed, and go in."""
-    return [(9.5, 0), (9.5, -2.5), (-4.6, -2.5), (3, -3), (3, -12.5), (0, -12.5)]
+    """Push the lid from its edge, no farther than needed, and go in on a diagonal."""
+    return [(9.5, -3), (-5.1, -3), (3, -5), (3, -12.5), (0, -12.5)]
