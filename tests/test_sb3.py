@@ -23,10 +23,12 @@ from cmc.policies import ModularPolicy, NegativeWeightError, PositiveNetwork
 from cmc.sb3 import (
     BatchedVecEnv,
     ContractingPolicy,
+    ContractingTD3Policy,
     ConvexGradientPolicy,
     IndependentPolicy,
 )
 from cmc.theory.action import action_of
+from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.certify import certify
 from cmc.theory.exact import Region
 
@@ -216,6 +218,13 @@ def test_edges_of_other_algorithms_and_layouts():
     for algorithm in (SAC, TD3, DDPG):
         with pytest.raises((AttributeError, TypeError), match="for PPO, A2C and their like"):
             algorithm(ContractingPolicy, peg, buffer_size=10)
+    with pytest.raises(AttributeError, match=r"there is ContractingTD3Policy"):
+        TD3(ContractingPolicy, peg, buffer_size=10)
+    for algorithm in (SB3PPO, SAC):
+        with pytest.raises(TypeError, match=r"for TD3 and DDPG.*there is ContractingPolicy"):
+            algorithm(ContractingTD3Policy, peg)
+    with pytest.raises(ValueError, match=r"wanted observations of shape \(2,\).*got \(3,\)"):
+        TD3(ContractingTD3Policy, gymnasium.make("Pendulum-v1"), buffer_size=10)
     with pytest.raises(ValueError, match="restarts in the same step"):
         BatchedVecEnv(gymnasium.make_vec(PEG, num_envs=2, vectorization_mode="sync"))
 
@@ -227,3 +236,91 @@ def test_the_policy_that_ppo_holds_can_be_certified_in_a_box():
     region = Region([1.0, -8.0], [3.0, -1.0])
     answer = certify(model.policy, plants.get("peg"), region=region, y_ref=[2.0, -4.0])
     assert not answer.refused, str(answer)
+
+
+class Slow(gymnasium.Env):
+    """Two lags whose action space is neither centred nor of width two."""
+
+    A, B, h = np.array([-1.0, -2.0]), np.array([1.0, -2.0]), 0.1
+    observation_space = spaces.Box(-9, 9, (4,), np.float32)
+    action_space = spaces.Box(np.float32([-1, -4]), np.float32([3, 4]))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.y, self.integral, self.k = self.np_random.uniform(-1, 1, 2), np.zeros(2), 0
+        return self._seen(), {}
+
+    def _seen(self):
+        self.integral = self.integral + self.h * self.y
+        return np.stack([self.y, self.integral], -1).ravel().astype(np.float32)
+
+    def step(self, u):
+        self.y = self.y + self.h * (self.A * self.y + self.B * u)
+        self.k += 1
+        return self._seen(), -float(np.square(self.y).sum()), False, self.k >= 40, {}
+
+
+@pytest.fixture(scope="module")
+def td3():
+    kwargs = {"R": [1.0, -1.0], "network_kwargs": {"slope_max": [0.5, 0.3]}, "net_arch": [8, 8]}
+    options = {"learning_starts": 40, "batch_size": 16, "buffer_size": 300, "device": "cpu"}
+    model = TD3(ContractingTD3Policy, Slow(), policy_kwargs=kwargs, seed=0, **options)
+    before = model.actor.mu.network.mlp.weights[0].detach().clone()
+    model.learn(120)
+    assert not torch.equal(before, model.actor.mu.network.mlp.weights[0])
+    return model
+
+
+def test_the_contracting_actor_of_td3_acts_and_is_saved(td3, tmp_path):
+    s = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
+    taken = td3.predict(s, deterministic=True)[0]
+    pi = action_of(td3.policy.on_signals(), 2)
+    wanted = [1.0, 0.0] + pi(s.reshape(50, 2, 2).astype(float), np.array([1.0, -1.0]))
+    np.testing.assert_allclose(taken, wanted, atol=1e-5)
+    assert set(map(id, td3.actor.optimizer.param_groups[0]["params"])) == set(
+        map(id, td3.actor.parameters())
+    )
+    td3.save(tmp_path / "model.zip")
+    again = TD3.load(tmp_path / "model.zip", device="cpu")
+    np.testing.assert_array_equal(again.predict(s, deterministic=True)[0], taken)
+    td3.policy.save(tmp_path / "policy.pt")
+    alone = ContractingTD3Policy.load(tmp_path / "policy.pt")
+    np.testing.assert_array_equal(alone.predict(s, deterministic=True)[0], taken)
+
+
+def test_the_contracting_actor_of_td3_keeps_its_signs_and_caps(td3):
+    low, high = td3.policy.slope_bounds()
+    assert (low == 0).all()  # tanh saturates
+    assert (high <= np.array([[2.0 * 0.5, 2.0 * 0.3], [4.0 * 0.5, 4.0 * 0.3]]) + 1e-6).all()
+    s = torch.randn(100, 4, requires_grad=True)
+    action = td3.actor(s)
+    for i, half in enumerate((2.0, 4.0)):
+        slope = torch.autograd.grad(action[:, i].sum(), s, retain_graph=True)[0].numpy() * half
+        own, other = slope[:, 2 * i : 2 * i + 2] * [-1.0, 1.0][i], slope[:, 2 - 2 * i : 4 - 2 * i]
+        assert (own > 0).all()
+        assert (own <= high[i] + 1e-6).all()
+        assert (other == 0).all()
+
+
+def test_td3_is_certified_where_tanh_is_not_flat(td3):
+    plant = plants.LinearPlant(np.diag(Slow.A), np.diag(Slow.B))
+    own = AuxiliarySpace.identity(plant.f_y([0, 0], [0, 0]), plant.f_u([0, 0], [0, 0]))
+    answer = certify(td3.policy, plant, transforms=own)
+    assert not answer
+    assert "no floor" in answer.reason
+    near = Region([-0.3] * 2, [0.3] * 2, integral=0.3)
+    assert certify(td3.policy, plant, region=near, transforms=own)
+    assert "wrong way" in certify(td3.policy, plant, region=near).reason  # decompose has R > 0
+
+
+def test_a_tanh_at_the_end_leaves_no_floor():
+    """Behind a tanh an unstable plant escapes from far away: nothing is certified everywhere."""
+    plant = plants.LinearPlant([[0.5]], [[1.0]])
+    network = PositiveNetwork(1, slope_min=[2.0, 0.5], slope_max=[3.0, 1.0])
+    assert certify(ModularPolicy(network), plant)
+    assert not certify(ModularPolicy(network, squash=True), plant)
+    s = np.random.default_rng(0).normal(size=(9, 1, 2))
+    policy = ModularPolicy(network, squash=True)
+    with torch.no_grad():
+        wanted = policy(torch.as_tensor(s.reshape(9, 2), dtype=torch.float32)).numpy()
+    np.testing.assert_allclose(action_of(policy, 1)(s, np.ones(1)), wanted, atol=1e-5)

@@ -1,4 +1,8 @@
-"""Any Gymnasium environment with a known model, seen and commanded in its auxiliary space."""
+"""Any Gymnasium environment with a known model, seen and commanded in its auxiliary space.
+
+`AuxiliarySpaceWrapper` is for one trajectory and any environment, `AuxiliarySpaceVectorWrapper` for
+the native batches of `PlantVectorEnv` and transforms that are kept.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +12,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
+from cmc.envs.plant_env import PlantVectorEnv
+from cmc.envs.vector import Array32, Step
 from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.tracking import Tracker
 
@@ -119,3 +126,61 @@ class AuxiliarySpaceWrapper(gym.Wrapper[NDArray[np.float32], Any, Any, Any]):
         box = self.observation_space
         assert isinstance(box, spaces.Box)
         return np.clip(s, box.low, box.high).astype(np.float32)
+
+
+class AuxiliarySpaceVectorWrapper(gym.vector.VectorWrapper[Array32, ArrayLike, Array]):
+    """N plants that are observed by (z_i, integral of z_i), s flat (N, 2 n), and moved by a.
+
+    z = T_y (y - target) and u = u0 + T_a a, clipped to the plant's limits, as in
+    `cmc.theory.simulate.closed_loop` with the same transforms: what was trained can be certified.
+
+    Args:
+        env: the plants; its `target` is y_d and its `h` the sample time.
+        transforms: kept at every state, such as `transforms_that_fit` offers.
+        u0: command to which T_a a is added, (n,); the one that holds the target by default.
+
+    Raises:
+        TypeError: if the transforms move with the state.
+        ValueError: if the plant cannot be held at the target.
+    """
+
+    def __init__(
+        self, env: PlantVectorEnv, transforms: AuxiliarySpace, *, u0: ArrayLike | None = None
+    ) -> None:
+        super().__init__(env)
+        if not isinstance(transforms, AuxiliarySpace) or transforms.T_y.ndim != 2:
+            raise TypeError(f"transforms: wanted an AuxiliarySpace of one state, got {transforms}")
+        self.plants, self.space, n = env, transforms, env.plant.n
+        held = env.plant.hold(env.target) if u0 is None else np.asarray(u0, dtype=float)
+        self.u0 = np.broadcast_to(held, (n,)).copy()
+        self.integral = np.zeros((env.num_envs, n))
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, (2 * n,), np.float32)
+        self.single_action_space = spaces.Box(-np.inf, np.inf, (n,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self.action_space = batch_space(self.single_action_space, env.num_envs)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Array32, dict[str, Any]]:
+        """Start episodes; each integral starts with the first error."""
+        obs, info = self.env.reset(seed=seed, options=options)
+        fresh = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs)), dtype=bool)
+        self.integral = np.where(fresh[:, None], 0.0, self.integral)
+        return self._seen(obs, fresh), info
+
+    def step(self, actions: ArrayLike) -> Step:
+        """Command u = u0 + T_a a."""
+        u = self.u0 + np.asarray(actions, dtype=float) @ self.space.T_a.T
+        obs, reward, ended, cut, info = self.env.step(u)
+        done, every = ended | cut, np.ones(self.num_envs, dtype=bool)
+        final = info.get("final_obs", obs)
+        seen = self._seen(final, every)
+        if "final_obs" in info:  # the trajectories that ended have started anew
+            info = {**info, "final_obs": seen}
+            self.integral = np.where(done[:, None], 0.0, self.integral)
+            seen = np.where(done[:, None], self._seen(obs, done), seen)
+        return seen, reward, ended, cut, info
+
+    def _seen(self, obs: Any, add: NDArray[np.bool_]) -> Array32:
+        z = (np.asarray(obs, dtype=float) - self.plants.target) @ self.space.T_y.T
+        self.integral = self.integral + self.plants.h * z * add[:, None]
+        s = np.stack([z, self.integral], axis=-1)
+        return s.reshape(self.num_envs, -1).astype(np.float32)

@@ -103,7 +103,12 @@ class ModularPolicy(nn.Module):
 
     def slope_bounds(self) -> tuple[Array, Array]:
         """Guaranteed interval of the slopes' magnitude, ([seeds,] n, 2) each."""
+        if not hasattr(self.network, "slope_bounds"):
+            name = type(self.network).__name__
+            raise TypeError(f"{name} has no slope_bounds(): nothing bounds its slopes")
         low, high = self.network.slope_bounds()  # type: ignore[operator]
+        if self.squash:  # tanh saturates
+            low = 0.0 * low
         if not self.integral:
             low[..., 1], high[..., 1] = 0.0, 0.0
         return low, high

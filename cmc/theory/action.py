@@ -117,7 +117,8 @@ def _in_double(policy: Any) -> Callable[[Array], Array]:
         raise TypeError(f"{name} sees a part of an observation, not (z, int z): pass a function")
     network = copy.deepcopy(getattr(policy, "network", policy)).double()
     like = next(network.parameters())
-    return lambda s: np.asarray(network(like.new_tensor(s)).detach().numpy())
+    end = np.tanh if getattr(policy, "squash", False) else np.asarray
+    return lambda s: end(network(like.new_tensor(s)).detach().numpy())
 
 
 def _numbers(policy: Any) -> Any:
