@@ -120,7 +120,13 @@ def test_without_the_integral(space):
 
 
 def test_the_table_of_combinations(space):
-    rows = {row[0]: row[1:] for row in space["rows"]}
-    assert rows["spiral"] == ["no", "no", "yes", "yes"]
-    assert rows["defective"][:2] == ["no", "yes"]
-    assert rows["unstable_mode"] == ["yes", "yes", "yes", "no"]
+    rows = {row[0]: dict(zip(space["head"], row[1:], strict=True)) for row in space["rows"]}
+    names = ["hierarchical", "schur", "feedback (policies)", "feedback (constant slopes)"]
+    wanted = {
+        "spiral": ["no", "no", "yes", "yes"],
+        "defective": ["no", "yes", "no", "no"],
+        "unstable_mode": ["yes", "yes", "yes", "no"],
+        "coupled_lags": ["yes", "yes", "yes", "yes"],
+    }
+    for plant, answers in wanted.items():
+        assert [rows[plant][name] for name in names] == answers
