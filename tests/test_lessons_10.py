@@ -5,8 +5,8 @@ import pytest
 from lesson import lesson
 
 from cmc import exercises
+from cmc.robot.osc import MAZE_GAINS, ControlLaw, Gains, TaskSpaceController
 from cmc.robot.panda import DOWN, forward_kinematics
-from cmc.robot.task_space import MAZE_GAINS, ControlLaw, Gains, TaskSpaceController
 
 HERE = lesson("10")
 FREE = HERE["FREE"]

@@ -96,7 +96,7 @@ def test_code_cells_are_short(path):
         assert length <= LONGEST, f"{length} lines: {cell.source[:60]!r} ..."
 
 
-DRAWING = {"figures", "ui", "schematics", "fig", "ax", "axes"}
+DRAWING = {"figures", "ui", "fig", "ax", "axes"}
 
 
 def statements(body):

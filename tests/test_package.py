@@ -18,7 +18,6 @@ PACKAGE = ROOT / "cmc"
 ORDER = [
     "__main__",
     "exercises",
-    "lessons",
     "sb3",
     "studies",
     "results",

@@ -26,9 +26,9 @@ def surrogate(answer: Callable[[Array, Array, float], float]) -> None:
         found = answer(np.array([r]), np.array([A]), 0.2)
         expect_close(found, wanted, f"the surrogate at r = {r}, A = {A:+.0f} ({what})")
     rng = np.random.default_rng(0)
-    r, A = rng.lognormal(sigma=0.4, size=50), rng.normal(size=50)
-    wanted = float(np.minimum(r * A, np.clip(r, 0.7, 1.3) * A).mean())
-    expect_close(answer(r, A, 0.3), wanted, "the mean over 50 samples at clip 0.3")
+    ratios, gains = rng.lognormal(sigma=0.4, size=50), rng.normal(size=50)
+    wanted = float(np.minimum(ratios * gains, np.clip(ratios, 0.7, 1.3) * gains).mean())
+    expect_close(answer(ratios, gains, 0.3), wanted, "the mean over 50 samples at clip 0.3")
 
 
 @check("09-slope-cap")

@@ -1,1 +1,0 @@
-"""What the pictures of the lessons compute: plain functions from numbers to arrays."""
