@@ -9,7 +9,7 @@ from cmc.studies import live, peg_maze, peg_push, runner
 from cmc.view.simulator import live_page, save_live_page
 
 STUDIES = {"peg_maze": peg_maze.STUDY, "peg_push": peg_push.STUDY}
-METHODS = {"peg_maze": ["ctd3"], "peg_push": ["ctd3", "td3_corrected"]}
+METHODS = {"peg_maze": ["ctd3"], "peg_push": ["ctd3", "frozen"]}
 pytestmark = pytest.mark.browser
 
 

@@ -113,4 +113,4 @@ def test_shipped_episodes_load_and_fit_their_scene(path: Path) -> None:
 
 def test_the_assets_stay_small() -> None:
     files = [path for path in store.asset("checkpoints").parent.rglob("*") if path.is_file()]
-    assert sum(path.stat().st_size for path in files) <= 30 * 2**20
+    assert sum(path.stat().st_size for path in files) <= 38 * 2**20

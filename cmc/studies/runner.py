@@ -80,7 +80,7 @@ def train(
         store.save_checkpoint(packed, kept | rows, record)  # before the state: a kill in between
         training.save(state, identity)  # repeats segments and loses none
 
-    saved = time.monotonic()
+    saved = -SAVE_EVERY  # the first segment is saved: the folder is taken from then on
     with interruptions() as interrupted:
         while training.steps < total and not interrupted():
             with single_thread():

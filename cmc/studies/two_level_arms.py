@@ -157,13 +157,13 @@ def two_level(
         planning = config.planning()
         actor, inputs = _planner(config, task, planning, seeds)
         view = CriticView(task, planning) if config.relative else None
-        planner = TD3(actor, seeds, inputs, len(planning.low), config.planner, stream=1, view=view)
+        agent = TD3(actor, seeds, inputs, len(planning.low), config.planner, stream=1, view=view)
         low: Any = low_level(config, seeds)
         correction = None
         if relabel:
             stride = min(config.joint_stride, config.task.horizon)
             correction = OffPolicyCorrection(low, seeds, config.task.horizon, stride)
-        return TwoLevelTraining(task, seeds, planner, low, planning, config.hierarchy, correction)
+        return TwoLevelTraining(task, seeds, agent, low, planning, config.hierarchy, correction)
 
     return build
 
@@ -181,10 +181,15 @@ def one_level(config: TwoLevelConfig, seeds: Seeds) -> OneLevelTraining:
 def _planner(
     config: TwoLevelConfig, task: PandaTask, planning: Planning, seeds: Seeds
 ) -> tuple[DirectPolicy, int]:
-    """Sub-goals in [-1, 1] from normalized observations, and the size of those."""
+    """The planner's network, and the size of what it sees."""
     size = planning.observe(task, task.reset()).shape[-1]
-    options = {"inputs": size, "hidden": config.planner_hidden, "seeds": seeds, "last": 1.0}
-    return DirectPolicy(JointNetwork(len(planning.low), **options), squash=True), size
+    return planner(size, len(planning.low), config.planner_hidden, seeds), size
+
+
+def planner(inputs: int, outputs: int, hidden: Sequence[int], seeds: Seeds) -> DirectPolicy:
+    """Sub-goals in [-1, 1] from normalized observations."""
+    network = JointNetwork(outputs, inputs=inputs, hidden=hidden, seeds=seeds, last=1.0)
+    return DirectPolicy(network, squash=True)
 
 
 def still(low: LowLevel) -> Fixed:

@@ -250,7 +250,9 @@ def motion(config: TwoLevelConfig, policy: Policy, episode: int) -> dict[str, An
         N, on the peg, `distance` (T + 1,) to the goal, m, `markers` (name to (3,) or (T + 1, 3)),
         `success` at the end and `touched` at any tick, and `text`.
     """
-    task, start = (config.make(1, TEST_SEED + episode) for _ in range(2))
+    task, start = config.make(1), config.make(1)
+    for each in (task, start):
+        each.seed([TEST_SEED + episode])
     start.reset()
     kept = (*KEPT, "tip", "target", "qpos", "force", "observation")
     found = {k: v[:, 0, 0] for k, v in play(task, config.planning(), *policy, 1, kept).items()}

@@ -44,7 +44,7 @@ _CENTER = (0.415, -0.0225, 0.005)
 _INVERSE_HALF = (1 / 0.015, 1 / 0.0075, 1 / 0.01)
 
 STUDY = TwoLevelStudy(
-    name="peg_maze",
+    name="peg_maze_tuned",
     task=SOFT,
     task_class=PegMaze,
     shift={"position": _CENTER, "goal": _CENTER},

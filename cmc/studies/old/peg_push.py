@@ -33,7 +33,7 @@ from cmc.studies.old import two_level_motion, two_level_training
 from cmc.studies.old.two_level import TwoLevelStudy
 
 STUDY = TwoLevelStudy(
-    name="peg_push",
+    name="peg_push_half",
     task=PUSH,
     task_class=PegPush,
     shift={"position": tuple(TARGET), "goal": tuple(TARGET)},
