@@ -108,18 +108,6 @@ def read_json(path: str | Path) -> dict[str, Any]:
     return content
 
 
-def result(name: str) -> dict[str, Any]:
-    """The shipped result `assets/results/NAME.json`; empty if it is not shipped.
-
-    Raises:
-        ValueError: if the file does not hold one JSON object.
-    """
-    try:
-        return read_json(asset("results", f"{name}.json"))
-    except FileNotFoundError:
-        return {}
-
-
 def provenance(command: str, seeds: list[int]) -> dict[str, Any]:
     """What produced a file: the command, seeds, commit and versions."""
     packages = ("numpy", "scipy", "torch", "mujoco", "gymnasium")

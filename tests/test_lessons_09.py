@@ -9,12 +9,12 @@ from cmc import exercises
 from cmc.learning.ppo import surrogate_gradient
 from cmc.policies import PositiveNetwork
 from cmc.results import tidy
-from cmc.studies import peg_touch
+from cmc.studies import peg_touch, runner
 from cmc.studies.detectors import judge
 from cmc.theory.sampled import largest_slope
 
 HERE = lesson("09")
-HERE |= {"TESTS": 60, "SECONDS": 2.0}  # as in the full lesson, on fewer plants
+POLICY = runner.load(peg_touch.STUDY, "cppo", 5000).policy
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_the_cap_holds_whatever_the_weights():
 
 
 def test_the_detector_is_the_studys():
-    tail, env = HERE["trial"](peg_touch.load("cppo", 5000), 5, "all, fast")
+    tail, env = HERE["trial"](POLICY, 5, "all, fast")
     flat = tail.reshape(len(tail), -1, 2)
     wanted = judge(flat, env.config.h).oscillation
     found = HERE["rattles"](tail).any(-1).ravel()
@@ -101,8 +101,8 @@ def test_the_detector_is_the_studys():
 
 def test_the_bound_predicts_who_rattles():
     for shift in ("nominal", "all, fast"):
-        tail, env = HERE["trial"](peg_touch.load("cppo", 5000), 5, shift)
-        gain, bound = HERE["loop_gain"](peg_touch.load("cppo", 5000), env, 5)
+        tail, env = HERE["trial"](POLICY, 5, shift)
+        gain, bound = HERE["loop_gain"](POLICY, env, 5)
         right = (gain > bound).any(-1) == HERE["rattles"](tail).any(-1)
         assert right.mean() > 0.95
 

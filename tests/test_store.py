@@ -165,11 +165,6 @@ def test_provenance_names_command_seeds_and_versions() -> None:
     assert record["commit"]
 
 
-def test_a_result_is_its_file_or_empty() -> None:
-    assert store.result("peg_maze")["study"] == "peg_maze"
-    assert store.result("nothing") == {}
-
-
 def test_an_unknown_asset_is_named() -> None:
     with pytest.raises(FileNotFoundError, match="no asset 'results/nothing.json'"):
         store.asset("results", "nothing.json")

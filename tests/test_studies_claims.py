@@ -67,9 +67,8 @@ LEARNING = {
 @pytest.mark.parametrize("text", LEARNING)
 def test_success_and_return_are_those_of_the_table_over_seeds(text: str) -> None:
     ours, (study, name) = FOUND[text].ours, LEARNING[text]
-    if ours == "not run":
-        assert not raw(study, name)
-        return
+    if not raw(study, name):  # an arm of an earlier planner stands in
+        study = verdicts.EARLIER[study]
     success, returns = (by_seed(study, name, key) for key in ("success", "return"))
     for part, values in (
         (ours.split(", return")[0], [100 * value for value in success]),

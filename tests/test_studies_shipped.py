@@ -25,7 +25,8 @@ SHIPPED = [
 
 def test_every_shipped_file_belongs_to_a_study() -> None:
     known = {f"{study}_{name}" for study, name in SHIPPED}
-    assert {path.stem for path in FOLDER.glob("*.safetensors")} == known
+    begun = {"peg_push_halfway"}  # a training that lesson 12 finishes
+    assert {path.stem for path in FOLDER.glob("*.safetensors")} - begun == known
     assert {path.stem for path in FOLDER.glob("*.json")} == known
 
 
@@ -113,4 +114,4 @@ def test_shipped_episodes_load_and_fit_their_scene(path: Path) -> None:
 
 def test_the_assets_stay_small() -> None:
     files = [path for path in store.asset("checkpoints").parent.rglob("*") if path.is_file()]
-    assert sum(path.stat().st_size for path in files) <= 38 * 2**20
+    assert sum(path.stat().st_size for path in files) <= 30 * 2**20

@@ -30,9 +30,7 @@ from typing import Any
 import numpy as np
 from torch import nn
 
-from cmc import store
 from cmc.envs.peg_touch_config import PegTouchConfig
-from cmc.studies import peg_touch_tests, runner
 from cmc.studies.peg_touch_arms import (
     Network,
     TouchConfig,
@@ -213,54 +211,3 @@ def at_period(h: float) -> Study:
 
 
 VARIANTS = {study.name: study for study in (at_period(0.002), at_period(0.005))}
-
-
-# -- names of earlier days, for lessons that still use them --
-
-TestConfig, NAME = peg_touch_tests.TestConfig, STUDY.name
-PegTouchStudy, run_test = TouchConfig, measure
-
-
-def task_of(name: str) -> PegTouchConfig:
-    """The environment as a method sees it."""
-    task: PegTouchConfig = STUDY.config_of(name).task
-    return task
-
-
-def build(name: str, seeds: Sequence[int] | None = None, _: Any = None) -> nn.Module:
-    """An untrained policy."""
-    training: Any = STUDY.method(name).build(STUDY.config_of(name), seeds)  # type: ignore[arg-type]
-    return training.network  # type: ignore[no-any-return]
-
-
-def load(
-    name: str, episode: int | None = None, *, seed: int | None = None, path: Any = None
-) -> nn.Module:
-    """A trained policy; with a seed, one without the leading axis."""
-    policy: nn.Module = runner.load(STUDY, name, episode, seed=seed, path=path).policy
-    if seed is None:
-        return policy
-    alone = build(name)
-    alone.load_state_dict(policy.state_dict(), strict=False)
-    return alone.eval()
-
-
-def contents(name: str, path: Any = None) -> tuple[list[int], dict[str, Any]]:
-    """The episodes of which policies are kept, and the record of the run."""
-    tensors, record = store.load_checkpoint(path or runner.find(STUDY, name))
-    return runner.marks_of(tensors), record
-
-
-def results() -> dict[str, Any]:
-    """The figures of earlier days."""
-    return store.read_json(store.asset("results", "peg_touch.json"))
-
-
-def select(answer: dict[str, Any], *, shift: str = "nominal", h: float = 0.01) -> list[Any]:
-    """The tests of one method under one shift and control period, by episode."""
-    return [t for t in answer["tests"] if t["shift"] == shift and t["h"] == h]
-
-
-def at(answer: dict[str, Any], episode: Any, *, shift: str = "nominal", h: float = 0.01) -> Any:
-    """The test of one method at one episode."""
-    return next(t for t in select(answer, shift=shift, h=h) if t["episode"] == episode)
