@@ -357,12 +357,14 @@ def ask(trial: Trial) -> Any:
     return certify(trial.policy, trial.plant, **kwargs)
 
 
-def main(count: int, first: int = 0) -> None:
-    """Print held, false and refused for each kind."""
+def main(count: int, first: int = 0, most: int = 8) -> None:
+    """Print held, false and refused for each kind, of plants with at most so many signals."""
     held, false, right, refused, raised, asked = (Counter() for _ in range(6))
     began = time.process_time()
     for seed in range(first, first + count):
         trial, rng = draw(seed), np.random.default_rng([seed, 1])
+        if trial.plant.n > most:
+            continue
         asked[trial.kind] += 1
         try:
             answer = ask(trial)

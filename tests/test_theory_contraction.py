@@ -13,11 +13,9 @@ from cmc.theory.contraction import (
     matrix_measure,
     metric_factor,
     overshoot,
-    peak_growth,
     rate_from_cloud,
-    rate_from_pair,
 )
-from cmc.theory.simulate import rk4
+from cmc.theory.simulate import linear_flow, rk4
 
 SHEARED = np.array([[-1.0, 8.0], [0.0, -1.5]])
 
@@ -39,14 +37,14 @@ def test_measured_rate_is_the_slowest_eigenvalue_and_its_bound_holds(A, slowest)
     assert (decay.ratio <= decay.bound * (1 + 1e-9) + 1e-11).all()
 
 
-def test_pair_is_a_cloud_of_two_and_a_metric_removes_the_overshoot():
+def test_a_metric_removes_the_overshoot_of_a_pair():
     times = np.linspace(0, 5, 400)
     starts = np.array([[0.0, 1.0], [0.3, -1.0]])
     paths = _cloud(SHEARED, times, starts)
-    plain = rate_from_pair(times, paths[:, 0], paths[:, 1])
+    plain = rate_from_cloud(times, paths)
     assert plain.overshoot > 1.5
     metric = lyapunov_metric(SHEARED, 0.9)
-    seen = rate_from_pair(times, paths[:, 0], paths[:, 1], metric)
+    seen = rate_from_cloud(times, paths, metric)
     assert seen.rate >= 0.9 - 1e-6
     assert seen.ratio.max() == 1.0
     assert plain.overshoot <= overshoot(metric)
@@ -57,8 +55,8 @@ def test_many_pairs_are_subsampled_and_bad_clouds_refused():
     paths = _cloud(-np.eye(2), times, rng.normal(size=(150, 2)))
     assert rate_from_cloud(times, paths).rate == pytest.approx(1.0, abs=1e-6)
     with pytest.raises(ValueError, match="same start"):
-        rate_from_pair(times, paths[:, 0], paths[:, 0])
-    with pytest.raises(ValueError, match="diverged"):
+        rate_from_cloud(times, paths[:, [0, 0]])
+    with pytest.raises(ValueError, match="paths needs finite"):
         rate_from_cloud(times, np.where(paths > 1, np.nan, paths))
     with pytest.raises(ValueError, match="paths needs shape"):
         rate_from_cloud(times, paths[:, 0])
@@ -87,7 +85,9 @@ def test_rate_in_a_metric_is_a_lower_bound_on_every_decay():
         rate = contraction_rate(A, metric)
         assert wanted - 1e-9 <= rate <= slowest + 1e-9
         assert contraction_factor(expm(0.3 * A), metric) <= np.exp(-0.3 * rate) + 1e-12
-        assert peak_growth(A, 5.0) <= overshoot(metric) * max(1, np.exp(-5 * rate)) + 1e-9
+        growth = np.linalg.norm(linear_flow(A, np.linspace(0, 5, 101)), 2, axis=(1, 2))
+        bound = overshoot(metric) * np.exp(-rate * np.linspace(0, 5, 101))
+        assert (growth <= bound * (1 + 1e-9)).all()
 
 
 def test_rate_in_a_moving_metric():
@@ -114,8 +114,25 @@ def test_metric_factor_and_its_refusals():
 
 
 def test_bounded_transient_of_a_sheared_lag():
-    assert peak_growth(-np.eye(2), 3.0) == 1.0
-    assert peak_growth(SHEARED, 5.0) > 2.0
+    growth = np.linalg.norm(linear_flow(SHEARED, np.linspace(0, 5, 101)), 2, axis=(1, 2))
+    assert growth.max() > 2.0
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: contraction_rate([[np.nan, 0.3], [-0.2, -2]]), "J needs finite"),
+        (lambda: contraction_rate(np.eye(3)[:2]), "J needs shape"),
+        (lambda: contraction_factor(np.eye(2) * np.inf, np.eye(2)), "transition needs finite"),
+        (lambda: overshoot([[np.nan]]), "metric needs finite"),
+        (lambda: floquet_multipliers(lambda t: -np.eye(2), np.inf), "period needs finite"),
+        (lambda: floquet_multipliers(lambda t: -np.eye(3), 1.0), r"jacobian\(0\) needs shape"),
+        (lambda: rate_from_cloud([0, 1, 2], [["a"]]), "paths needs real numbers"),
+    ],
+)
+def test_bad_arguments_are_named(call, words):
+    with pytest.raises((ValueError, TypeError), match=words):
+        call()
 
 
 def test_floquet_multipliers():

@@ -1,7 +1,11 @@
-"""The one door for arrays: what is wrong with an argument, said with its name."""
+"""The one door for arrays: what is wrong with an argument, said with its name; and compiling."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -80,6 +84,14 @@ def count(name: str, value: int, most: int = 1_000_000) -> int:
     if isinstance(value, bool) or value != value or int(value) != value or not 1 <= value <= most:
         raise ValueError(f"{name} needs a whole number from 1 to {most}, got {value!r}")
     return int(value)
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """Compile on the first call; keep it on disk where there is a place to keep it."""
+    try:
+        return numba.njit(cache=True, error_model="numpy")(function)
+    except RuntimeError:  # a read-only installation without a home
+        return numba.njit(error_model="numpy")(function)
 
 
 def _short(value: object) -> str:

@@ -6,26 +6,21 @@ diagonal and `R = T_y f_u T_a` upper triangular: each action moves its own signa
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from cmc.theory.arrays import checked
+from cmc.theory.explicit import spaces_of, triangular_of
 from cmc.theory.spectrum import (
-    CHUNK,
-    MAX_CONDITION,
-    SINGULAR,
     Array,
     ComplexEigenvalueError,
     DefectiveMatrixError,
     SingularInputError,
     checked_pair,
     checked_square,
-    raise_complex,
-    raise_defective,
-    raise_singular,
     real_eigenbasis,
 )
 
@@ -169,36 +164,46 @@ def decompose(f_y: ArrayLike, f_u: ArrayLike) -> AuxiliarySpace:
     Source: appendix "Proof of the theorem for the hierarchical combination" (the theorem's own text
     prints `T_y = V` and forgets a transpose, see `cmc.theory.as_printed`).
     """
-    if getattr(f_y, "shape", None) == getattr(f_u, "shape", None) == (2, 2):
-        space = _decompose_one_planar(f_y, f_u)  # type: ignore[arg-type]
-        if space is not None:
-            return space
+    space = _at_once(f_y, f_u)
+    if space is not None:
+        return space
     f_y, f_u = checked_pair(f_y, f_u)
-    eigenvalues, V = real_eigenbasis(f_y)
-    return assemble(eigenvalues, V, f_u)
+    return assemble(*real_eigenbasis(f_y), f_u)
+
+
+def _at_once(f_y: Any, f_u: Any) -> AuxiliarySpace | None:
+    """All systems in one compiled call; None where the general road has to say what is wrong."""
+    shape: tuple[int, ...] = getattr(f_y, "shape", ())
+    if (
+        len(shape) < 2
+        or shape != getattr(f_u, "shape", ())
+        or shape[-1] != shape[-2]
+        or not f_y.size
+    ):
+        return None
+    if not f_y.dtype == f_u.dtype == np.float64:
+        return None
+    flat = [np.ascontiguousarray(x).reshape(-1, *shape[-2:]) for x in (f_y, f_u)]
+    arrays = np.empty((4, *flat[0].shape))
+    try:
+        if not spaces_of(*flat, arrays):
+            return None
+    except ValueError:  # how the compiled eig says that an eigenvalue is complex
+        return None
+    return _trusted(*arrays.reshape(4, *shape))
 
 
 def assemble(eigenvalues: Array, V: Array, f_u: Array) -> AuxiliarySpace:
     """Build the space from an eigenbasis: eigenvalues (..., n), `V` and `f_u` (..., n, n)."""
-    shape, n = V.shape, V.shape[-1]
-    if n != 2 or V.ndim == 2:
-        T_y = inverse(V)
-        T_a, R = triangularize(T_y @ f_u)
-        return _trusted(T_y, T_a, eigenvalues[..., None] * np.eye(n), R)
-    eigenvalues, V, f_u = eigenvalues.reshape(-1, n), V.reshape(-1, n, n), f_u.reshape(-1, n, n)
-    arrays = np.empty((4, len(V), n, n))
-    for start in range(0, len(V), CHUNK):
-        part = slice(start, start + CHUNK)
-        T_y, T_a, Lambda, R = arrays[:, part]
-        T_y[:] = inverse(V[part])
-        T_a[:], R[:] = triangularize(_planar_product(T_y, f_u[part]))
-        Lambda[:] = 0.0
-        np.einsum("kii->ki", Lambda)[:] = eigenvalues[part]
-    return _trusted(*arrays.reshape(4, *shape))
+    T_y = inverse(V)
+    T_a, R = triangularize(T_y @ f_u)
+    return _trusted(T_y, T_a, eigenvalues[..., None] * np.eye(V.shape[-1]), R)
 
 
 def triangularize(W: Array) -> tuple[Array, Array]:
     """Return an orthogonal `T_a` and `R = W T_a`, upper triangular with a positive diagonal.
+
+    `W^T P = Q R_qr` with P the exchange matrix gives `T_a = Q P` and `R = P R_qr^T P`.
 
     Args:
         W: `T_y f_u`, (..., n, n), invertible.
@@ -206,47 +211,16 @@ def triangularize(W: Array) -> tuple[Array, Array]:
     Returns:
         `T_a` and `R`, each (..., n, n).
     """
-    if W.shape[-1] == 2:
-        return _triangularize_planar(W)
-    # W^T P = Q R_qr with P the exchange matrix; T_a = Q P, R = P R_qr^T P
-    Q, R_qr = np.linalg.qr(np.swapaxes(W, -1, -2)[..., ::-1])
-    T_a, R = Q[..., ::-1], np.swapaxes(R_qr, -1, -2)[..., ::-1, ::-1]
-    sign = np.copysign(1.0, np.diagonal(R, axis1=-2, axis2=-1))[..., None, :]
-    return T_a * sign, R * sign
-
-
-def _triangularize_planar(W: Array) -> tuple[Array, Array]:
-    """Closed form of the transposed QR: the second row of `W` fixes the second column of `T_a`."""
-    p, q, r, s = W[..., 0, 0], W[..., 0, 1], W[..., 1, 0], W[..., 1, 1]
-    length = np.sqrt(r * r + s * s)
-    det = p * s - q * r
-    sign = np.copysign(1.0, det)
-    T_a, R = np.empty(W.shape), np.zeros(W.shape)
-    x, y = r / length, s / length
-    T_a[..., 0, 1], T_a[..., 1, 1] = x, y
-    T_a[..., 0, 0], T_a[..., 1, 0] = sign * y, -sign * x
-    R[..., 0, 0], R[..., 0, 1], R[..., 1, 1] = np.abs(det) / length, p * x + q * y, length
-    return T_a, R
-
-
-def _planar_product(T_y: Array, f_u: Array) -> Array:
-    """Many 2x2 products: faster written out than through matmul."""
-    W = np.empty(T_y.shape)
-    for i in range(2):
-        for j in range(2):
-            W[..., i, j] = T_y[..., i, 0] * f_u[..., 0, j] + T_y[..., i, 1] * f_u[..., 1, j]
-    return W
+    flat = np.ascontiguousarray(W, dtype=np.float64).reshape(-1, *W.shape[-2:])
+    T_a, R = np.empty(flat.shape), np.empty(flat.shape)
+    for k in range(len(flat)):
+        triangular_of(flat[k], T_a[k], R[k])
+    return T_a.reshape(W.shape), R.reshape(W.shape)
 
 
 def inverse(V: Array) -> Array:
-    """Return `V^-1` for (..., n, n), in closed form for n = 2."""
-    if V.shape[-1] != 2:
-        return np.asarray(np.linalg.inv(V), dtype=np.float64)
-    T_y = np.empty(V.shape)
-    det = V[..., 0, 0] * V[..., 1, 1] - V[..., 0, 1] * V[..., 1, 0]
-    T_y[..., 0, 0], T_y[..., 0, 1] = V[..., 1, 1] / det, -V[..., 0, 1] / det
-    T_y[..., 1, 0], T_y[..., 1, 1] = -V[..., 1, 0] / det, V[..., 0, 0] / det
-    return T_y
+    """Return `V^-1` for (..., n, n)."""
+    return np.asarray(np.linalg.inv(V), dtype=np.float64)
 
 
 def _trusted(T_y: Array, T_a: Array, Lambda: Array, R: Array) -> AuxiliarySpace:
@@ -254,50 +228,3 @@ def _trusted(T_y: Array, T_a: Array, Lambda: Array, R: Array) -> AuxiliarySpace:
     space = object.__new__(AuxiliarySpace)
     space.__dict__.update(T_y=T_y, T_a=T_a, Lambda=Lambda, R=R)
     return space
-
-
-def _decompose_one_planar(f_y: Array, f_u: Array) -> AuxiliarySpace | None:
-    """One 2x2 system in plain floats, for a control loop. None leaves it to the general path."""
-    if f_y.dtype != np.float64 or f_u.dtype != np.float64:
-        return None
-    (a, b), (c, d) = f_y.tolist()
-    (p, q), (r, s) = f_u.tolist()
-    h, det_u = 0.5 * (a - d), p * s - q * r
-    disc = h * h + b * c
-    if not (math.isfinite(disc) and math.isfinite(det_u)):
-        return None  # the general path says which entry is not finite
-    limit = ((b - c) / MAX_CONDITION) ** 2
-    if disc <= limit:
-        if h == b == c == 0.0:
-            return None
-        if disc < -limit:
-            raise_complex(0.5 * (a + d), math.sqrt(-disc))
-        raise_defective()
-    if abs(det_u) <= SINGULAR * (p * p + q * q + r * r + s * s):
-        raise_singular()
-    root = math.sqrt(disc)
-    if h >= 0.0:
-        x1, y1 = h + root, c
-        x2, y2 = -b, x1
-    else:
-        x1, y1 = b, root - h
-        x2, y2 = -y1, c
-    # unit columns, largest component positive
-    k1 = math.copysign(math.sqrt(x1 * x1 + y1 * y1), x1 if abs(x1) >= abs(y1) else y1)
-    k2 = math.copysign(math.sqrt(x2 * x2 + y2 * y2), x2 if abs(x2) >= abs(y2) else y2)
-    x1, y1, x2, y2 = x1 / k1, y1 / k1, x2 / k2, y2 / k2
-    det = x1 * y2 - x2 * y1
-    t11, t12, t21, t22 = y2 / det, -x2 / det, -y1 / det, x1 / det
-    # W = T_y f_u, then the transposed QR: the second row of W is R_22 times a column of T_a
-    w11, w12, w21, w22 = t11 * p + t12 * r, t11 * q + t12 * s, t21 * p + t22 * r, t21 * q + t22 * s
-    length = math.sqrt(w21 * w21 + w22 * w22)
-    x, y = w21 / length, w22 / length
-    det_w = w11 * w22 - w12 * w21
-    e1, e2 = (y, -x) if det_w > 0.0 else (-y, x)
-    mean = 0.5 * (a + d)
-    flat = (
-        (t11, t12, t21, t22, e1, x, e2, y)
-        + (mean + root, 0.0, 0.0, mean - root)
-        + (abs(det_w) / length, w11 * x + w12 * y, 0.0, length)
-    )
-    return _trusted(*np.array(flat).reshape(4, 2, 2))

@@ -4,7 +4,7 @@ A system contracts at `rate` > 0 if the distance of any two trajectories obeys
 
     d(t) <= overshoot e^{-rate t} d(0).
 
-Measured: `rate_from_pair` and `rate_from_cloud` fit the two numbers to simulated trajectories.
+Measured: `rate_from_cloud` fits the two numbers to simulated trajectories.
 Derived: `contraction_rate` reads the rate off the differential dynamics in a metric, which also
 bounds the overshoot by sqrt(cond(M)). The first sees what happened, the second what must happen.
 (appendix A; Lohmiller and Slotine, Automatica 34, 1998.)
@@ -16,11 +16,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
-from scipy.linalg import expm, solve_continuous_lyapunov
+from scipy.linalg import solve_continuous_lyapunov
 
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array, checked, count, number
 
 _MAX_PAIRS = 4000
 
@@ -47,24 +47,6 @@ class Decay:
         return self.overshoot * np.exp(-self.rate * (self.times - self.times[0]))
 
 
-def rate_from_pair(
-    times: ArrayLike, first: ArrayLike, second: ArrayLike, metric: ArrayLike | None = None
-) -> Decay:
-    """Fit rate and overshoot to the distance of two trajectories.
-
-    Args:
-        times: Increasing times, s, (T,).
-        first: One trajectory, (T, n).
-        second: The other, (T, n), from another start.
-        metric: Positive definite M of the distance sqrt(d^T M d), (n, n); identity by default.
-
-    Raises:
-        ValueError: for wrong shapes, values that are not finite, or equal starts.
-    """
-    pair = np.stack([np.asarray(first, dtype=float), np.asarray(second, dtype=float)], axis=1)
-    return rate_from_cloud(times, pair, metric)
-
-
 def rate_from_cloud(times: ArrayLike, paths: ArrayLike, metric: ArrayLike | None = None) -> Decay:
     """Fit rate and overshoot to the worst pair of a cloud of trajectories.
 
@@ -81,13 +63,12 @@ def rate_from_cloud(times: ArrayLike, paths: ArrayLike, metric: ArrayLike | None
     Raises:
         ValueError: for wrong shapes, values that are not finite, or equal starts.
     """
-    times, paths = np.asarray(times, dtype=float), np.asarray(paths, dtype=float)
-    if times.ndim != 1 or len(times) < 3 or not (np.diff(times) > 0).all():
+    times = checked("times", times, "time")
+    if len(times) < 3 or not (np.diff(times) > 0).all():
         raise ValueError("times needs at least 3 increasing values")
-    if paths.ndim != 3 or len(paths) != len(times) or paths.shape[1] < 2:
+    paths = checked("paths", paths, "time N n", time=len(times))
+    if paths.shape[1] < 2:
         raise ValueError(f"paths needs shape ({len(times)}, N >= 2, n), got {paths.shape}")
-    if not np.isfinite(paths).all():
-        raise ValueError("paths needs finite values; a trajectory has diverged")
     i, j = np.triu_indices(paths.shape[1], 1)
     if len(i) > _MAX_PAIRS:
         keep = np.random.default_rng(0).choice(len(i), _MAX_PAIRS, replace=False)
@@ -121,12 +102,10 @@ def metric_factor(metric: ArrayLike) -> Array:
     Raises:
         ValueError: if the metric is not symmetric positive definite.
     """
-    metric = np.asarray(metric, dtype=float)
-    if metric.ndim < 2 or metric.shape[-1] != metric.shape[-2]:
-        raise ValueError(f"a metric needs shape (..., n, n), got {metric.shape}")
+    metric = checked("metric", metric, "... n n")
     flipped = np.swapaxes(metric, -1, -2)
-    if not np.isfinite(metric).all() or not np.allclose(metric, flipped, rtol=1e-6):
-        raise ValueError("a metric needs to be finite and symmetric")
+    if not np.allclose(metric, flipped, rtol=1e-6):
+        raise ValueError("a metric needs to be symmetric")
     try:
         return np.swapaxes(np.linalg.cholesky((metric + flipped) / 2), -1, -2)
     except np.linalg.LinAlgError:
@@ -145,7 +124,7 @@ def matrix_measure(J: ArrayLike, norm: float = 2) -> Array:
     Raises:
         ValueError: if `norm` is not 1, 2 or infinity.
     """
-    J = np.asarray(J, dtype=float)
+    J = checked("J", J, "... n n")
     if norm == 2:
         return np.linalg.eigvalsh((J + np.swapaxes(J, -1, -2)) / 2)[..., -1]
     if norm not in (1, np.inf):
@@ -171,14 +150,15 @@ def contraction_rate(
     Raises:
         ValueError: if the metric is not symmetric positive definite.
     """
-    J = np.asarray(J, dtype=float)
+    J = checked("J", J, "... n n")
     if metric is None:
         return -matrix_measure(J)
     theta = metric_factor(metric)
     inverse = np.linalg.inv(theta)
     generalised = theta @ J @ inverse
     if metric_dot is not None:
-        turn = np.swapaxes(inverse, -1, -2) @ np.asarray(metric_dot, dtype=float) @ inverse
+        moving = checked("metric_dot", metric_dot, "... n n", n=J.shape[-1])
+        turn = np.swapaxes(inverse, -1, -2) @ moving @ inverse
         generalised = generalised + turn / 2
     return -matrix_measure(generalised)
 
@@ -190,7 +170,9 @@ def contraction_factor(transition: ArrayLike, metric: ArrayLike) -> Array:
     """
     theta = metric_factor(metric)
     return np.linalg.norm(
-        theta @ np.asarray(transition, dtype=float) @ np.linalg.inv(theta), 2, axis=(-2, -1)
+        theta @ checked("transition", transition, "... n n") @ np.linalg.inv(theta),
+        2,
+        axis=(-2, -1),
     )
 
 
@@ -202,7 +184,7 @@ def lyapunov_metric(J: ArrayLike, rate: float = 0.0) -> Array:
     Raises:
         ValueError: if some eigenvalue of J has a real part of -rate or more.
     """
-    J = np.asarray(J, dtype=float)
+    J, rate = checked("J", J, "n n"), number("rate", rate)
     slowest = float(np.linalg.eigvals(J).real.max())
     if slowest >= -rate:
         raise ValueError(
@@ -216,21 +198,7 @@ def lyapunov_metric(J: ArrayLike, rate: float = 0.0) -> Array:
 
 def overshoot(metric: ArrayLike) -> Array:
     """Bound on the Euclidean transient that a metric allows: sqrt(cond(M)), (...,)."""
-    return np.sqrt(np.linalg.cond(np.asarray(metric, dtype=float)))
-
-
-def peak_growth(J: ArrayLike, horizon: float, samples: int = 400) -> float:
-    """Largest Euclidean growth max ||e^{J t}|| of a constant Jacobian over `horizon` seconds.
-
-    Above 1 the distance first grows although every eigenvalue decays: a bounded transient.
-    """
-    J = np.asarray(J, dtype=float)
-    step = expm(J * (horizon / samples))
-    power, peak = np.eye(len(J)), 1.0
-    for _ in range(samples):
-        power = step @ power
-        peak = max(peak, float(np.linalg.norm(power, 2)))
-    return peak
+    return np.sqrt(np.linalg.cond(checked("metric", metric, "... n n")))
 
 
 def floquet_multipliers(jacobian: Callable[[float], Array], period: float, n: int = 2) -> Array:
@@ -244,6 +212,8 @@ def floquet_multipliers(jacobian: Callable[[float], Array], period: float, n: in
         period: Period, s.
         n: Size of J.
     """
+    period, n = number("period", period, above=0.0), count("n", n, 100)
+    checked("jacobian(0)", jacobian(0.0), "n n", n=n)
 
     def variational(t: float, flat: Array) -> Array:
         return (jacobian(t) @ flat.reshape(n, n)).ravel()

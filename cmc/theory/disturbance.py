@@ -7,12 +7,11 @@ be reached: `worst_constant` (a matrix norm) and `peak_gain` (the worst signal o
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
+from cmc.theory.arrays import Array, checked, count, number
 from cmc.theory.contraction import metric_factor
-
-Array = NDArray[np.float64]
 
 KINDS = ("constant", "switching", "sine", "white")
 
@@ -23,9 +22,7 @@ def checked_stable(jacobian: ArrayLike) -> tuple[Array, float]:
     Raises:
         ValueError: if it is not square, not finite or not stable.
     """
-    J = np.asarray(jacobian, float)
-    if J.ndim != 2 or J.shape[0] != J.shape[1] or not np.isfinite(J).all():
-        raise ValueError(f"wanted a finite Jacobian of shape (n, n), got {J.shape}")
+    J = checked("jacobian", jacobian, "n n")
     abscissa = float(np.linalg.eigvals(J).real.max())
     if not abscissa < 0.0:
         raise ValueError(f"the loop is not stable: largest real part {abscissa:.3g} 1/s")
@@ -34,7 +31,7 @@ def checked_stable(jacobian: ArrayLike) -> tuple[Array, float]:
 
 def _impulse_response(J: Array, channel: ArrayLike, row: ArrayLike, times: Array) -> Array:
     """Rows row e^{J t} B at many times, (..., m)."""
-    B, c = np.asarray(channel, float), np.asarray(row, float)
+    B, c = checked("channel", channel, "n m", n=len(J)), checked("row", row, "n", n=len(J))
     values, V = np.linalg.eig(J)
     if np.linalg.cond(V) > 1e6:  # nearly defective: the eigenvectors lose too many digits
         slow: Array = c @ expm(times[..., None, None] * J) @ B
@@ -64,7 +61,9 @@ def worst_constant(
     """
     J, _ = checked_stable(jacobian)
     theta = np.eye(len(J)) if metric is None else metric_factor(metric)
-    _, sizes, directions = np.linalg.svd(-theta @ np.linalg.solve(J, np.asarray(channel, float)))
+    _, sizes, directions = np.linalg.svd(
+        -theta @ np.linalg.solve(J, checked("channel", channel, "n m", n=len(J)))
+    )
     return float(sizes[0]), directions[0]
 
 
@@ -81,7 +80,7 @@ def worst_signal(
         |row xi(t_k)| of the worst signal aimed at each of `times`, (steps + 1,).
     """
     J, _ = checked_stable(jacobian)
-    t = np.asarray(times, float)
+    t = checked("times", times, "time")
     middle = 0.5 * (t[1:] + t[:-1])
     weight = _impulse_response(J, channel, row, t[-1] - middle)
     length = np.linalg.norm(weight, axis=-1, keepdims=True)
@@ -136,8 +135,8 @@ def random_disturbances(
     Returns:
         Array (steps, batch, m).
     """
-    if steps < 1 or batch < 1 or m < 1 or not size >= 0.0:
-        raise ValueError(f"wanted steps, batch, m >= 1 and size >= 0, got {steps, batch, m, size}")
+    steps, batch, m = count("steps", steps), count("batch", batch), count("m", m)
+    size, step = number("size", size, least=0.0), number("step", step, above=0.0)
     direction = rng.normal(size=(batch, m))
     direction *= size / np.linalg.norm(direction, axis=-1, keepdims=True)
     kind = np.arange(batch) % len(KINDS)

@@ -18,14 +18,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import solve_continuous_lyapunov
-from scipy.optimize import minimize, minimize_scalar
+from numpy.typing import ArrayLike
+from scipy.optimize import minimize
 
+from cmc.theory.arrays import Array, checked, count
 from cmc.theory.contraction import metric_factor
-from cmc.theory.disturbance import checked_stable
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -70,10 +67,11 @@ def reach(
         channel: B, (n, m).
         samples: values of a that are tried.
     """
-    J, M = np.asarray(jacobians, float), np.asarray(metric, float)
+    J, M = checked("jacobians", jacobians, "... n n"), checked("metric", metric, "n n")
     J = J.reshape(-1, *J.shape[-2:])
-    theta = metric_factor(M)
-    push = theta @ np.asarray(channel, float)
+    checked("jacobians", J, "V n n", n=len(M))
+    theta, samples = metric_factor(M), count("samples", samples, 10_000)
+    push = theta @ checked("channel", channel, "n m", n=len(M))
     local = theta @ J @ np.linalg.inv(theta)
     local = local + np.swapaxes(local, -1, -2)
     slowest = -float(np.linalg.eigvalsh(local)[:, -1].max())
@@ -113,7 +111,9 @@ def shape_metric(
     Raises:
         ValueError: if the corners do not contract in `metric`.
     """
-    M = np.asarray(metric, float)
+    M = checked("metric", metric, "n n")
+    row = checked("row", row, "n", n=len(M))
+    rounds, evaluations = count("rounds", rounds, 100), count("evaluations", evaluations)
     if not np.isfinite(reach(jacobians, M, channel, samples=12).reach):
         raise ValueError("the loop does not contract in the metric to begin with")
     corner = np.tril_indices(len(M))
@@ -136,35 +136,3 @@ def shape_metric(
     for _ in range(rounds):
         x = minimize(promise, x, method="Nelder-Mead", options=options).x
     return reach(jacobians, candidate(x), channel)
-
-
-def tightest_ellipsoid(
-    jacobian: ArrayLike, channel: ArrayLike, row: ArrayLike
-) -> tuple[Array, float]:
-    """The constant metric that promises most about one signal under ||d|| <= 1.
-
-    For a in (0, -2 max Re lambda) let J Q + Q J^T + a Q + B B^T / a = 0. Then from rest
-    xi^T Q^{-1} xi <= 1 for ever, so |row xi| <= sqrt(row Q row^T); a is searched for the smallest.
-    (Abedor, Nagpal, Poolla 1996.)
-
-    Returns:
-        The metric M = Q^{-1}, in which the disturbed loop stays within distance 1, and the bound
-        on |row xi|.
-
-    Raises:
-        ValueError: if the loop is not stable.
-    """
-    J, abscissa = checked_stable(jacobian)
-    B, c = np.asarray(channel, float), np.asarray(row, float)
-
-    def ellipsoid(a: float) -> Array:
-        Q = solve_continuous_lyapunov(J + 0.5 * a * np.eye(len(J)), -B @ B.T / a)
-        return 0.5 * (Q + Q.T)
-
-    def reach(logit: float) -> float:
-        return float(c @ ellipsoid(-2.0 * abscissa / (1.0 + np.exp(-logit))) @ c)
-
-    found = minimize_scalar(reach, bounds=(-8.0, 8.0), method="bounded")
-    best = ellipsoid(-2.0 * abscissa / (1.0 + np.exp(-found.x)))
-    metric = np.asarray(np.linalg.inv(best), dtype=np.float64)
-    return metric, float(np.sqrt(c @ best @ c))

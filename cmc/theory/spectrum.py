@@ -1,4 +1,4 @@
-"""Real eigenbases of `f_y`, with every reason why there may be none said in one sentence.
+"""Real eigenbases of `f_y`, compiled, with every reason why there may be none in one sentence.
 
 The columns of `V` are eigenvectors, `f_y = V Lambda V^-1`. Order, sign and length of an eigenvector
 are free; here the slowest mode (largest eigenvalue) comes first, columns have unit norm and their
@@ -12,15 +12,12 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cmc.theory.arrays import Array
+from cmc.theory.explicit import MAX_CONDITION, bases_of
 from cmc.theory.jacobians import not_square
 
-Array = NDArray[np.float64]
-
-EPS = float(np.finfo(np.float64).eps)
-MAX_CONDITION = 2e7
-"""Above this condition number of `V` (about 1/sqrt(eps)) a matrix counts as defective."""
 SINGULAR = 1e-12
-"""Below this reciprocal condition number `f_u` counts as singular."""
+"""Below this share of a row that no other row explains, in the best units, `f_u` is singular."""
 
 
 class ComplexEigenvalueError(ValueError):
@@ -78,12 +75,13 @@ def checked_pair(f_y: ArrayLike, f_u: ArrayLike) -> tuple[Array, Array]:
 
 
 def _refuse_singular(f_u: Array) -> None:
-    if f_u.shape[-1] == 2:
-        det = f_u[..., 0, 0] * f_u[..., 1, 1] - f_u[..., 0, 1] * f_u[..., 1, 0]
-        singular = np.abs(det) <= SINGULAR * np.einsum("...ij,...ij->...", f_u, f_u)
-    else:
-        sigma = np.linalg.svd(f_u, compute_uv=False)
-        singular = sigma[..., -1] <= SINGULAR * sigma[..., 0]
+    """Rows and columns are brought to a largest entry of 1 first: units make nothing singular."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        even = f_u / np.abs(f_u).max(axis=-1, keepdims=True)
+        even = even / np.abs(even).max(axis=-2, keepdims=True)
+    even = np.nan_to_num(even)
+    sigma = np.linalg.svd(even, compute_uv=False)
+    singular = sigma[..., -1] <= SINGULAR * sigma[..., 0]
     if singular.any():
         raise_singular(_where(singular))
 
@@ -117,79 +115,36 @@ def raise_defective(where: str = "") -> NoReturn:
 def real_eigenbasis(f_y: Array) -> tuple[Array, Array]:
     """Return eigenvalues (..., n), descending, and unit eigenvectors `V` (..., n, n).
 
-    Closed form for n = 2, LAPACK otherwise. `f_y` is taken as validated.
+    `f_y` is taken as validated.
 
     Raises:
         ComplexEigenvalueError: If a matrix has a complex pair.
         DefectiveMatrixError: If a matrix is defective to working precision.
     """
-    if f_y.shape[-1] == 2:
-        return _planar(f_y)
+    flat = np.ascontiguousarray(f_y, dtype=np.float64).reshape(-1, *f_y.shape[-2:])
+    w, V = np.empty(flat.shape[:2]), np.empty(flat.shape)
+    try:
+        found = bases_of(flat, w, V)
+    except ValueError:  # how the compiled eig says that an eigenvalue is complex
+        found = False
+    if found and not _ill_conditioned(w, V).any():
+        return w.reshape(f_y.shape[:-1]), V.reshape(f_y.shape)
     eigenvalues, V = _lapack(f_y)
     rows = np.abs(V).argmax(axis=-2)[..., None, :]
     return eigenvalues, V * np.copysign(1.0, np.take_along_axis(V, rows, axis=-2))
 
 
-CHUNK = 4096
-"""Planar batches are worked through in pieces of this many systems, which stay in the cache."""
-
-
-def _planar(f_y: Array) -> tuple[Array, Array]:
-    """Closed form for (..., 2, 2), refused as a whole and then solved piece by piece."""
-    flat = f_y.reshape(-1, 2, 2)
-    eigenvalues, V = np.empty((len(flat), 2)), np.empty(flat.shape)
-    bad = np.zeros(len(flat), dtype=bool)
-    for start in range(0, len(flat), CHUNK):
-        part = slice(start, start + CHUNK)
-        bad[part] = _planar_piece(flat[part], eigenvalues[part], V[part])
-    if bad.any():
-        _explain_planar(f_y, bad.reshape(f_y.shape[:-2]))
-    return eigenvalues.reshape(f_y.shape[:-1]), V.reshape(f_y.shape)
-
-
-def _planar_piece(f_y: Array, eigenvalues: Array, V: Array) -> NDArray[np.bool_]:
-    """Write roots and eigenvectors (no cancellation) of (N, 2, 2); return which have none."""
-    a, b, c, d = f_y[:, 0, 0], f_y[:, 0, 1], f_y[:, 1, 0], f_y[:, 1, 1]
-    mean, h = 0.5 * (a + d), 0.5 * (a - d)
-    disc = h * h + b * c
-    # sin(angle between the eigenvectors) = 2 sqrt(disc) / hypot(b - c, 2 sqrt(disc))
-    bad = disc <= ((b - c) / MAX_CONDITION) ** 2
-    root = np.sqrt(np.abs(disc))
-    p, flip = np.abs(h) + root, h < 0.0
-    x1, y1 = np.where(flip, b, p), np.where(flip, p, c)
-    x2, y2 = np.where(flip, -p, -b), np.where(flip, c, p)
-    if bad.any():
-        scalar = (h == 0.0) & (b == 0.0) & (c == 0.0)  # a multiple of I: every basis will do
-        bad &= ~scalar
-        x1[scalar], y1[scalar], x2[scalar], y2[scalar] = 1.0, 0.0, 0.0, 1.0
-        x1[bad], y1[bad], x2[bad], y2[bad] = 1.0, 0.0, 0.0, 1.0
-    k1 = np.copysign(np.sqrt(x1 * x1 + y1 * y1), np.where(np.abs(x1) >= np.abs(y1), x1, y1))
-    k2 = np.copysign(np.sqrt(x2 * x2 + y2 * y2), np.where(np.abs(x2) >= np.abs(y2), x2, y2))
-    V[:, 0, 0], V[:, 1, 0], V[:, 0, 1], V[:, 1, 1] = x1 / k1, y1 / k1, x2 / k2, y2 / k2
-    eigenvalues[:, 0], eigenvalues[:, 1] = mean + root, mean - root
-    return bad
-
-
-def _explain_planar(f_y: Array, bad: NDArray[np.bool_]) -> NoReturn:
-    a, b, c, d = f_y[..., 0, 0], f_y[..., 0, 1], f_y[..., 1, 0], f_y[..., 1, 1]
-    disc = 0.25 * (a - d) ** 2 + b * c
-    pairs = bad & (disc < -(((b - c) / MAX_CONDITION) ** 2))
-    if pairs.any():
-        k = int(np.flatnonzero(pairs)[0])
-        mean = 0.5 * float(a.flat[k] + d.flat[k])
-        raise_complex(mean, float(-disc.flat[k]) ** 0.5, _where(pairs))
-    raise_defective(_where(bad))
-
-
 def _lapack(f_y: Array) -> tuple[Array, Array]:
+    """In numpy: it sorts out why there is no basis, and pairs that are complex by rounding."""
     eigenvalues, V = np.linalg.eig(f_y)
+    # numpy 2.5 returns complex arrays whatever is in them
     if np.iscomplexobj(eigenvalues):
         eigenvalues, V = _drop_rounding(f_y, eigenvalues, V)
     if (eigenvalues[..., 1:] > eigenvalues[..., :-1]).any():
         order = np.argsort(-eigenvalues, axis=-1, kind="stable")
         eigenvalues = np.take_along_axis(eigenvalues, order, axis=-1)
         V = np.take_along_axis(V, order[..., None, :], axis=-1)
-    defective = _ill_conditioned(V)
+    defective = _ill_conditioned(eigenvalues, V)
     if defective.any():
         raise_defective(_where(defective))
     return eigenvalues, V
@@ -200,7 +155,7 @@ def _drop_rounding(f_y: Array, eigenvalues: Array, V: Array) -> tuple[Array, Arr
     size = np.linalg.norm(f_y, axis=(-2, -1))
     pairs = np.abs(eigenvalues.imag).max(axis=-1) > 1e-12 * size
     if pairs.any():
-        defective = pairs & _ill_conditioned(V)
+        defective = pairs & _ill_conditioned(eigenvalues, V)
         if (pairs & ~defective).any():
             k = int(np.flatnonzero(pairs & ~defective)[0])
             row = eigenvalues.reshape(-1, eigenvalues.shape[-1])[k]
@@ -213,9 +168,25 @@ def _drop_rounding(f_y: Array, eigenvalues: Array, V: Array) -> tuple[Array, Arr
     return eigenvalues.real.copy(), basis / np.where(norm > 0.0, norm, 1.0)
 
 
-def _ill_conditioned(V: NDArray[np.inexact]) -> NDArray[np.bool_]:
+def _ill_conditioned(w: NDArray[np.inexact], V: NDArray[np.inexact]) -> NDArray[np.bool_]:
+    """Whether V is close to singular: as it is, and not for the units of the signals alone.
+
+    Units alone are the cause where rows scaled to a largest entry of 1 are well conditioned and no
+    two eigenvalues are close.
+    """
+    bad = _condition(V) > MAX_CONDITION
+    if not bad.any():
+        return bad
+    rows = np.abs(V).max(axis=-1, keepdims=True)
+    even = _condition(V / np.where(rows > 0.0, rows, 1.0)) <= MAX_CONDITION
+    gap = np.abs(w[..., :, None] - w[..., None, :]) + np.diag(np.full(w.shape[-1], np.inf))
+    apart = gap.min(axis=(-2, -1)) > np.abs(w).max(axis=-1) / MAX_CONDITION
+    return bad & ~(even & apart)
+
+
+def _condition(V: NDArray[np.inexact]) -> Array:
     sigma = np.linalg.svd(V, compute_uv=False)
-    return np.asarray(sigma[..., -1] * MAX_CONDITION < sigma[..., 0])
+    return np.asarray(sigma[..., 0] / np.maximum(sigma[..., -1], 1e-300), dtype=np.float64)
 
 
 def _where(bad: NDArray[np.bool_]) -> str:
