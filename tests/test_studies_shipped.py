@@ -27,7 +27,7 @@ def test_every_shipped_file_belongs_to_a_study() -> None:
     known = {f"{study}_{name}" for study, name in SHIPPED}
     begun = {"peg_push_halfway"}  # a training that lesson 12 finishes
     assert {path.stem for path in FOLDER.glob("*.safetensors")} - begun == known
-    assert {path.stem for path in FOLDER.glob("*.json")} == known
+    assert {path.stem for path in FOLDER.glob("*.json")} - begun == known
 
 
 @pytest.mark.parametrize(("study", "name"), SHIPPED)
