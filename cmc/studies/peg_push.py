@@ -128,7 +128,7 @@ STUDY = Study(
             for scale in (0.4, 0.7, 2.0, 4.0)
         ),
     ),
-    length=480_000,
+    length=600_000,
     every=60_000,
     judge=judge,
     motion=motion,
