@@ -14,6 +14,7 @@ from cmc.learning.low_level import Fixed, latent_policy
 from cmc.learning.planning import CriticView, Planning
 from cmc.learning.td3 import TD3, Batch, TD3Config
 from cmc.policies import DirectPolicy, JointNetwork
+from cmc.results import at, compare, tidy
 
 HERE = lesson("11")
 HERE |= {"STEPS": 480, "WARM_UP": 160, "TESTS": 2, "TEST_EVERY": 480}
@@ -247,3 +248,74 @@ def test_a_sub_goal_that_does_not_shrink_is_named():
         return int(np.argmin([((actions - [act(s, g) for s in states]) ** 2).sum() for g in goals]))
 
     assert "shrinks" in repr(exercises.check("11-relabel", still))
+
+
+# ---- sentences about shipped results
+
+
+@pytest.fixture(scope="module")
+def table():
+    return at(tidy("peg_maze").query("test == 'nominal'"))
+
+
+@pytest.fixture(scope="module")
+def tuned():
+    return at(tidy("peg_maze_tuned").query("test == 'nominal'"))
+
+
+def by(table, method, key="success"):
+    return table[table.method == method][key]
+
+
+def test_learning_pays_from_an_untuned_start(table):
+    assert round(100 * by(table, "ctd3").mean()) == 99
+    assert round(100 * by(table, "ctd3").min()) == 96
+    assert round(100 * by(table, "frozen").mean()) == 59
+    assert (100 * by(table, "frozen").min(), 100 * by(table, "frozen").max()) == (1, 99)
+    assert by(table, "ctd3", "return").min() > by(table, "frozen", "return").max()
+    found = compare(table, [("ctd3", "frozen", key) for key in ("success", "return")])
+    assert found.p_holm.round(2).tolist() == [0.06, 0.02]
+    assert round(found.p_holm.iloc[1], 3) == 0.016
+
+
+def test_nothing_is_left_to_learn_from_a_slope_set_by_hand(tuned):
+    assert by(tuned, "ctd3").min() == by(tuned, "frozen").min() == 1.0
+    found = compare(tuned, [("ctd3", "frozen", "return")])
+    assert found.low.iloc[0] < 0 < found.high.iloc[0]
+
+
+def test_the_others_end_low_so_far(table, tuned):
+    for name in ("td3", "td3_corrected", "ctd3_paper", "control"):
+        assert by(tuned, name).mean() < 0.21
+    if "td3_corrected" in set(table.method):
+        assert by(table, "td3_corrected").mean() < 0.21
+    assert by(tuned, "ctd3_paper").max() == 0.0
+
+
+def test_hiro_is_compared_with_a_rigid_peg(table):
+    shares = {}
+    for study in ("peg_maze", "peg_maze_stiff"):
+        rows = tidy(study).query("test == 'nominal'")
+        shares[study] = 100 * rows.groupby("method").below_1_N_50hz.mean()
+    assert round(shares["peg_maze_stiff"]["ctd3"], 1) == 92.2
+    assert round(shares["peg_maze"]["hiro"], 1) == 90.9
+    assert shares["peg_maze"]["ctd3"] > 99.95
+    hiro = table[table.method == "hiro"]
+    assert (round(100 * hiro.success.mean()), hiro.seed.nunique(), hiro.step.max()) == (
+        16,
+        3,
+        500_000,
+    )
+    assert round(100 * by(table, "hiro_matched").mean()) == 34
+
+
+def test_the_cap_costs_a_few_percent():
+    """Cost of a 5 mm step at the cap, above the least over all gains."""
+    L, slopes = SOFT.gains.latent, np.linspace(0, 60, 61)
+    cap = (1.0 / 0.02 - L.K_d[0]) / L.K2[0]
+    for config in (SOFT, STIFF):
+        g = torch.tensor(slopes / config.u_limit[0], dtype=torch.float32)[None, :, None]
+        step = 0.005 * torch.ones(1, 61, 6)
+        path = HERE["unroll"](HERE["by_hand"](g), config, step, 0 * step)
+        cost = torch.stack([e[0, :, 0].abs() for _, e in path]).mean(0).numpy()
+        assert 0 <= np.interp(cap, slopes, cost) / cost.min() - 1 < 0.08

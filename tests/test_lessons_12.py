@@ -7,6 +7,7 @@ from lesson import lesson
 
 from cmc import exercises
 from cmc.learning.low_level import CriticLow, Segment
+from cmc.results import at, compare, tidy
 
 HERE = lesson("12")
 HERE |= {"FITS": 300, "SAMPLES": 3000, "STARTS": 1, "LENGTH": 100, "TESTS": 2}
@@ -173,3 +174,55 @@ def test_exercises_name_the_slip(name, wrong, message):
     verdict = exercises.check(name, wrong)
     assert not verdict
     assert message in repr(verdict)
+
+
+# ---- sentences about shipped results
+
+
+@pytest.fixture(scope="module")
+def now():
+    return at(tidy("peg_push").query("test == 'nominal'"))
+
+
+@pytest.fixture(scope="module")
+def earlier():
+    return at(tidy("peg_push_half").query("test == 'nominal'"))
+
+
+def by(table, method, key="success"):
+    return table[table.method == method][key]
+
+
+def test_learning_pays_in_speed_and_not_in_success(now):
+    learned, frozen = (by(now, name) for name in ("ctd3", "frozen"))
+    assert learned.min() > 0.85
+    assert min(learned.mean(), frozen.mean()) > 0.9
+    assert frozen.mean() >= learned.mean() - 0.01
+    fast, slow = (by(now, name, "return") for name in ("ctd3", "frozen"))
+    assert fast.min() > slow.max()
+    assert 2.5 < slow.mean() / fast.mean() < 4.0
+    assert -40 < fast.mean() < -28
+    found = compare(now, [("ctd3", "frozen", "success"), ("ctd3", "frozen", "return")])
+    assert found.p.iloc[0] > 0.05
+    assert round(found.p_holm.iloc[1], 3) == 0.016
+    assert now[now.method == "ctd3"].step.max() <= 600_000
+    assert by(now, "ctd3", "largest_N").max() > 30
+    assert by(now, "frozen", "largest_N").max() < 15
+    assert now.deepest_mm.max() < 0.2
+
+
+def test_earlier_runs_do_not_touch_reliably(earlier):
+    assert earlier.groupby("method").success.mean().max() < 0.65
+    returns = earlier.groupby("method")["return"].mean().round()
+    names = ["td3", "control", "ppo_control", "ctd3_paper"]
+    assert returns[names].tolist() == [-798, -458, -358, -663]
+    shares = (100 * earlier.groupby("method").success.mean()).round()
+    assert shares[names].tolist() == [0, 8, 0, 0]
+    assert earlier.step.max() == 1_000_000
+
+
+def test_td3_comes_no_nearer_than_centimeters():
+    rows = tidy("peg_push_half", "episodes")
+    assert round(rows[rows.method == "td3"].nearest_mm.median(), 1) == 12.7
+    near = rows[rows.method == "ppo_control"].final_mm
+    assert 1.4 < near.median() < 1.8  # on the unmoved obstacle
