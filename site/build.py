@@ -28,7 +28,7 @@ SITE = ROOT / "site"
 HIDDEN = {"exercises", "__main__"}
 """Rooms that are not imported by readers."""
 LIVE = {
-    "two_arms": ["peg_push", "--live", "--method", "ctd3", "--beside", "td3"],
+    "two_arms": ["peg_push_half", "--live", "--method", "ctd3", "--beside", "td3"],
     "peg_maze": ["peg_maze", "--live"],
     "peg_push": ["peg_push", "--live"],
 }
