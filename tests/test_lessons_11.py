@@ -9,7 +9,7 @@ from cmc import exercises
 from cmc.envs.peg_maze import SOFT, STIFF, PegMaze
 from cmc.learning.hierarchy import rollout
 from cmc.learning.hiro import log_likelihood
-from cmc.learning.latent import LatentConfig, LatentLow, LatentModel
+from cmc.learning.latent import LatentConfig, LatentModel, Rollouts
 from cmc.learning.low_level import Fixed, latent_policy
 from cmc.learning.planning import CriticView, Planning
 from cmc.learning.td3 import TD3, Batch, TD3Config
@@ -25,8 +25,8 @@ def low():
     return HERE["Low"](STIFF, start_gain=5.0)
 
 
-def latent_low(low, config, price):
-    """The library's learner around the lesson's network."""
+def rollouts(config, price):
+    """The library's rollouts of the lesson's model."""
     L = config.gains.latent
     model = LatentModel(
         L.K_p,
@@ -38,7 +38,7 @@ def latent_low(low, config, price):
         np.repeat([1.0, 0.0], 3),
         config.tick,
     )
-    return LatentLow(latent_policy(low.net), [0], model, 20, LatentConfig(force_weight=price))
+    return Rollouts(model, 20, LatentConfig(force_weight=price))
 
 
 @pytest.mark.parametrize("price", [0.0, 0.7])
@@ -47,7 +47,8 @@ def test_the_rollout_is_the_librarys(low, price):
     e, v, push = (s * torch.randn(1, 16, 6, generator=draw) for s in (0.004, 0.01, 0.2))
     blocked = (torch.rand(1, 16, 6, generator=draw) < 0.3) & (HERE["MASS"] > 0)
     ours = HERE["cost"](low, STIFF, e, v, push, blocked, price)
-    theirs = latent_low(low, STIFF, price).loss(torch.cat([e, v], -1), blocked, push)
+    starts = torch.cat([e, v], -1)
+    theirs = rollouts(STIFF, price).cost(latent_policy(low.net), starts, blocked, push)
     torch.testing.assert_close(ours, theirs[0], rtol=1e-4, atol=1e-6)
 
 

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from cmc import store
-from cmc.studies import registry
 
 _ARRAYS = ("t", "qpos", "tip", "force", "distance")
 _ENDS = ("success", "touched")
@@ -56,6 +55,8 @@ def load(path: str | Path) -> dict[str, Any]:
         FileNotFoundError: if no episode of this name is shipped.
         CheckpointError: if the file is damaged, foreign, or does not fit its scene.
     """
+    from cmc.studies import registry  # brings torch, which the file itself does not need
+
     path = Path(path)
     file = path if path.suffix else store.asset("episodes", f"{path}.npz")
     try:
