@@ -155,7 +155,7 @@ def test_failures_are_named_in_three_coordinates(tip, lid, obstacle, end):
 
 
 def test_shipped_episodes_are_sorted():
-    run = HERE["episodes"]("control")
+    run = HERE["episodes"]("control", HERE["OLD"])
     assert len(run["ends"]) == run["tip"].shape[1] > 0
     assert run["qpos"].shape[:2] == run["tip"].shape[:2]
 

@@ -147,7 +147,7 @@ class AuxiliarySpaceVectorWrapper(gym.vector.VectorWrapper[Array32, ArrayLike, A
     def __init__(
         self, env: PlantVectorEnv, transforms: AuxiliarySpace, *, u0: ArrayLike | None = None
     ) -> None:
-        super().__init__(env)
+        super().__init__(env)  # type: ignore[arg-type]
         if not isinstance(transforms, AuxiliarySpace) or transforms.T_y.ndim != 2:
             raise TypeError(f"transforms: wanted an AuxiliarySpace of one state, got {transforms}")
         self.plants, self.space, n = env, transforms, env.plant.n

@@ -39,7 +39,7 @@ def order(answer: Callable[[Array], Any]) -> None:
 def hold(answer: Callable[[Callable[[float], bool], float, float], float]) -> None:
     """Judge `my_hold(proved, low, high)`: the largest proved h to 1 %, with few questions."""
     for edge, low, high in ((0.37, 0.05, 3.0), (2.9, 0.05, 3.0), (0.051, 0.05, 3.0)):
-        asked = []
+        asked: list[float] = []
 
         def proved(h: float, edge: float = edge, asked: list[float] = asked) -> bool:
             asked.append(h)

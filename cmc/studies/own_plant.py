@@ -73,7 +73,7 @@ class PenalisedPPO(PPO):
         with torch.no_grad():
             for weight, step in zip(weights, steps, strict=True):
                 if step is not None:
-                    weight -= PENALTY * step
+                    weight.sub_(PENALTY * step)
         return report
 
 
@@ -124,7 +124,8 @@ def trial(action: Any, shifted: bool) -> tuple[float, float, float]:
     spread = np.exp(rng.uniform(np.log([0.5, 0.5, 0.7, 0.7]), np.log([3, 3, 1.4, 1.4]), (TESTS, 4)))
     spread = spread.T if shifted else np.ones((4, TESTS))
     y, integral = rng.uniform(PLANT.y_low, PLANT.y_high, (TESTS, 2)), np.zeros((TESTS, 2))
-    total, errors, dt = np.zeros(TESTS), [], H / 8
+    total, dt = np.zeros(TESTS), H / 8
+    errors: list[Any] = []
     for _ in range(2 * STEPS):
         z = (y - GOAL) @ SPACE.T_y.T
         integral = integral + H * z
@@ -160,9 +161,10 @@ METHODS = {
 
 def compare(updates: int = UPDATES) -> pd.DataFrame:
     """A row for each method and seed."""
-    rows = []
+    rows: list[tuple[Any, ...]] = []
     for name, title in METHODS.items():
-        begin, policy, seeds = time.process_time(), LQR() if name == "lqr" else build(name), SEEDS
+        begin, policy = time.process_time(), LQR() if name == "lqr" else build(name)
+        seeds: tuple[int, ...] = SEEDS
         if name == "lqr":
             seeds = (0,)
         else:
