@@ -126,7 +126,8 @@ def matrix_measure(J: ArrayLike, norm: float = 2) -> Array:
     """
     J = checked("J", J, "... n n")
     if norm == 2:
-        return np.linalg.eigvalsh((J + np.swapaxes(J, -1, -2)) / 2)[..., -1]
+        rate = np.linalg.eigvalsh((J + np.swapaxes(J, -1, -2)) / 2)[..., -1]
+        return np.asarray(rate, dtype=np.float64)
     if norm not in (1, np.inf):
         raise ValueError(f"norm needs to be 1, 2 or infinity, got {norm}")
     diagonal = np.diagonal(J, axis1=-2, axis2=-1)
