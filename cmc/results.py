@@ -20,6 +20,7 @@ Columns of `tidy(study)`; other tables are described in `TABLES`:
 | seed | of the training |
 | episodes, trajectories | how many the row is about |
 | return | mean sum of rewards |
+| cost | low_level: mean cost of segments of the latent model (`cmc.learning.latent`) |
 | success, touched | share of episodes with the tip in the goal at the last tick, at any tick |
 | passed_by | share of episodes that touched and were elsewhere at the last tick |
 | nearest_mm, final_mm | median distance to the goal, smallest and at the end, mm |

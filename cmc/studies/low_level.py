@@ -130,7 +130,7 @@ def table(
     seeds: Sequence[int] = range(5),
     updates: int = UPDATES,
 ) -> pd.DataFrame:
-    """A row for each setting, method and seed: `setting`, `method`, `seed`, `cost`."""
+    """A row for each setting (`test`), method and seed, with its `cost`."""
     config, rows = STUDY.config_of("ctd3"), []
     limit, tick = config.slope_cap(), config.task.tick
     with single_thread():
@@ -146,8 +146,10 @@ def table(
                 ("nominal gain", gains[:1]),
                 ("searched gain", gains[1:]),
             ):
+                row = {"method": method, "title": method, "test": setting, "last": True}
+                row["step"] = updates if method == "learned" else 0
                 rows += [
-                    {"setting": setting, "method": method, "seed": int(seed), "cost": float(cost)}
+                    {**row, "seed": int(seed), "cost": float(cost)}
                     for seed, cost in zip(seeds, costs, strict=False)
                 ]
     return pd.DataFrame(rows)
@@ -157,7 +159,7 @@ def main() -> None:
     """Command line."""
     found = table()
     made = store.provenance("python -m cmc.studies.low_level", list(range(5)))
-    print(found.groupby(["setting", "method"], sort=False).cost.agg(["mean", "min", "max"]))
+    print(found.groupby(["test", "method"], sort=False).cost.agg(["mean", "min", "max"]))
     print(results.write(Path("assets/results"), "tests", found, {"study": "low_level", **made}))
 
 
