@@ -68,7 +68,8 @@ def test_cascade_against_its_closed_form(space, modules, strength):
     for k in range(modules):  # k levels above the free module: (strength t)^k e^-t / k!
         wanted = (strength * t) ** k * np.exp(-t) / math.factorial(k)
         np.testing.assert_allclose(out["sizes"][:, -1 - k], np.maximum(wanted, 1e-6), atol=1e-6)
-        np.testing.assert_array_equal(out["dots"][:, -1 - k, 1], k)
+        np.testing.assert_array_equal(out[f"dot_{k}"][:, 0, 1], k)
+        np.testing.assert_array_equal(out[f"size_{k}"], out["sizes"][:, -1 - k])
     assert f"{out['sizes'][:, 0].max():.2f}" in out["text"]
 
 

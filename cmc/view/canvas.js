@@ -567,7 +567,7 @@ class View {
     if (frame.time) {
       const last = frame.time.shape[0] - 1;
       this.slider.max = last;
-      this.cursor = Math.min(this.cursor ?? last, last);
+      this.cursor = Math.min(this.cursor ?? 0, last);  // a motion opens at its beginning
     } else {
       this.cursor = null;
     }
