@@ -198,7 +198,12 @@ class Truth:
             space = decompose(plant.f_y(zero, zero), plant.f_u(zero, zero))
             self.spaces = lambda y: (space.T_y, space.T_a)
         else:
-            from cmc.theory.simulate import transforms_of
+            try:
+                from cmc.theory.simulate import transforms_of
+            except ImportError:  # as it was before eigenvectors kept their signs
+
+                def transforms_of(plant, *_):
+                    return lambda y: decompose(plant.f_y(y, u := plant.hold(y)), plant.f_u(y, u))
 
             found = transforms_of(plant, None, zero)
             self.spaces = lambda y: ((space := found(y)).T_y, space.T_a)

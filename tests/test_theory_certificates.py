@@ -8,10 +8,10 @@ from cmc import plants
 from cmc.theory.certificates import (
     circle_criterion,
     common_metric,
-    compose_hierarchical,
     rate_in,
 )
 from cmc.theory.contraction import contraction_rate
+from cmc.theory.hierarchy import compose_hierarchical
 from cmc.theory.metric_search import condition_metric, search_metric
 
 # ---------------------------------------------------------------- the circle criterion

@@ -81,7 +81,6 @@ class Plant(ABC):
             units: One unit per latent signal.
 
         Raises:
-            TypeError: If f returns no real numbers.
             ValueError: If there are not as many commands as signals, shapes do not fit, f is not
                 finite in the box, or a given Jacobian does not belong to f.
         """
@@ -151,7 +150,7 @@ class FunctionPlant(Plant):
         self.u_low, self.u_high = (
             np.broadcast_to(checked(f"u[{k}]", end), (m,)).copy() for k, end in enumerate(commands)
         )
-        if not ((self.y_low < self.y_high).all() and (self.u_low < self.u_high).all()):
+        if (self.y_low >= self.y_high).any() or (self.u_low >= self.u_high).any():
             raise ValueError("y and u each need (low, high) with low < high")
         self.state_names = tuple(state_names or (f"y{i + 1}" for i in range(self.n)))
         self.units = tuple(units or ("1",) * self.n)
@@ -245,8 +244,7 @@ class FunctionPlant(Plant):
 
     def _is_affine(self) -> bool:
         """Whether f is affine and free of time, on points of the boxes and far beyond them."""
-        rng, n = np.random.default_rng(1), self.n
-        reach = 10.0 ** np.arange(3).repeat(8)[:, None]
+        rng, n, reach = np.random.default_rng(1), self.n, 10.0 ** np.arange(3).repeat(8)[:, None]
         y = (self.y_high + self.y_low) / 2 + reach * (self.y_high - self.y_low) * rng.uniform(
             -0.5, 0.5, (24, n)
         )
@@ -254,11 +252,10 @@ class FunctionPlant(Plant):
             -0.5, 0.5, (24, n)
         )
         A, B = self.f_y(y[0], u[0]), self.f_u(y[0], u[0])
-        with np.errstate(all="ignore"):
-            try:
-                found, later = self.f(y, u), self.f(y, u, 0.618)
-            except (ValueError, ArithmeticError):
-                return False
+        try:
+            found, later = self.f(y, u), self.f(y, u, 0.618)
+        except (ValueError, ArithmeticError):
+            return False
         wanted = self.f(y[0], u[0]) + (y - y[0]) @ A.T + (u - u[0]) @ B.T
         tol = 1e-9 if self.how != "central differences" else 1e-6
         size = tol * (np.abs(y) @ np.abs(A).T + np.abs(u) @ np.abs(B).T)

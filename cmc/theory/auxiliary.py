@@ -162,7 +162,7 @@ def decompose(f_y: ArrayLike, f_u: ArrayLike) -> AuxiliarySpace:
         ValueError: If shapes do not fit or an entry is NaN or infinite.
 
     Source: appendix "Proof of the theorem for the hierarchical combination" (the theorem's own text
-    prints `T_y = V` and forgets a transpose, see `cmc.theory.as_printed`).
+    prints `T_y = V` and forgets a transpose; lesson 04 shows that both are needed).
     """
     space = _at_once(f_y, f_u)
     if space is not None:

@@ -13,17 +13,26 @@ Rounding is part of the account: a rate is lowered by a bound on it before it is
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag
 
 from cmc.theory.arrays import Array, checked, number
 from cmc.theory.contraction import metric_factor, overshoot
+from cmc.theory.differential import loop_jacobian
 from cmc.theory.metric_search import MetricSearch, condition_metric, search_metric
+
+__all__ = [
+    "Certificate",
+    "best_conditioned",
+    "circle_criterion",
+    "common_metric",
+    "loop_jacobian",
+    "rate_in",
+    "rates_in",
+]
 
 Kind = Literal["frozen", "exact"]
 Domain = Literal["continuous", "sampled"]
@@ -94,31 +103,6 @@ class Certificate:
         if self.holds:
             line += f": rate {self.rate:.3g} 1/s, overshoot at most {self.overshoot:.3g}"
         return f"{line}. {self.reason}" if self.reason else line
-
-
-def loop_jacobian(Lambda: ArrayLike, R: ArrayLike, p: ArrayLike, q: ArrayLike) -> Array:
-    """Jacobian [[Lambda + R P, R Q], [I, 0]] of the loop in (z, int z), (..., 2n, 2n).
-
-    Args:
-        Lambda: Open-loop Jacobian in z, (..., n, n), 1/s.
-        R: Gain of the auxiliary command, (..., n, n).
-        p: Signed slopes dpi_i/dz_i, (..., n).
-        q: Signed slopes dpi_i/d(int z_i), (..., n).
-    """
-    Lambda, R = np.asarray(Lambda, dtype=float), np.asarray(R, dtype=float)
-    p, q = np.asarray(p, dtype=float), np.asarray(q, dtype=float)
-    n = Lambda.shape[-1]
-    if p.shape[-1:] != (n,) or q.shape[-1:] != (n,) or R.shape[-2:] != (n, n):
-        raise ValueError(
-            f"Lambda {Lambda.shape} needs R (..., {n}, {n}) and slopes (..., {n}), "
-            f"got R {R.shape}, p {p.shape}, q {q.shape}"
-        )
-    RP, RQ = R * p[..., None, :], R * q[..., None, :]
-    shape = np.broadcast_shapes(Lambda.shape, RP.shape, RQ.shape)
-    J = np.zeros((*shape[:-2], 2 * n, 2 * n))
-    J[..., :n, :n], J[..., :n, n:] = Lambda + RP, RQ
-    J[..., n:, :n] = np.eye(n)
-    return J
 
 
 def circle_criterion(c: float, k1: float, k2: float, *, region: str = "everywhere") -> Certificate:
@@ -308,53 +292,3 @@ def _why_not(worst: Array, domain: Domain) -> str:
     if domain == "continuous" and eigenvalues.real.max() >= 0:
         return f"a vertex is unstable: eigenvalue real part {eigenvalues.real.max():.4g} 1/s"
     return "every vertex decays by itself, but no quadratic metric fits them all"
-
-
-def compose_hierarchical(
-    metrics: Sequence[Array],
-    rates: Sequence[float],
-    couplings: Mapping[tuple[int, int], ArrayLike],
-    *,
-    h: float | None = None,
-) -> tuple[Array, float]:
-    """Metric and rate of an upper block-triangular combination of contracting blocks.
-
-    Block i is driven by blocks j > i only. Scaling block i by eps^(n-1-i) shrinks every coupling by
-    a power of eps, so some eps > 0 keeps the rate as near to the slowest block's as wanted.
-
-    Args:
-        metrics: One metric per block, (m_i, m_i).
-        rates: One rate per block, 1/s, positive.
-        couplings: For i < j the vertices (V, m_i, m_j) of the block through which j drives i.
-        h: Sample time, s, where the blocks are steps.
-
-    Returns:
-        The block-diagonal metric and the rate in 1/s.
-
-    Raises:
-        ValueError: if a rate is not positive or a coupling points the wrong way.
-    """
-    if not (np.isfinite(rates).all() and min(rates) > 0):
-        raise ValueError(f"every block needs a positive rate, got {list(rates)}")
-    if any(i >= j for i, j in couplings):
-        raise ValueError("blocks may only be driven by later ones: couplings need i < j")
-    theta = [metric_factor(metric) for metric in metrics]
-    size = len(metrics)
-    strength = np.zeros((size, size))
-    for (i, j), block in couplings.items():
-        local = theta[i] @ np.asarray(block, dtype=float) @ np.linalg.inv(theta[j])
-        strength[i, j] = np.linalg.norm(local, 2, axis=(-2, -1)).max()
-    eps, level = 1.0, np.arange(size)
-    for _ in range(200):
-        scaled = strength * eps ** np.maximum(level[None] - level[:, None], 0)
-        if h is None:
-            comparison = scaled - np.diag(rates)
-            rate = -float(np.linalg.eigvalsh((comparison + comparison.T) / 2)[-1])
-        else:
-            comparison = scaled + np.diag(np.exp(-h * np.asarray(rates)))
-            rate = -float(np.log(np.linalg.norm(comparison, 2))) / h
-        if rate >= _SHARE * min(rates):
-            break
-        eps *= 0.7
-    blocks = [eps ** (2 * (size - 1 - i)) * metric for i, metric in enumerate(metrics)]
-    return block_diag(*blocks), rate

@@ -107,7 +107,8 @@ def metric_factor(metric: ArrayLike) -> Array:
     if not np.allclose(metric, flipped, rtol=1e-6):
         raise ValueError("a metric needs to be symmetric")
     try:
-        return np.swapaxes(np.linalg.cholesky((metric + flipped) / 2), -1, -2)
+        factor = np.linalg.cholesky((metric + flipped) / 2)
+        return np.asarray(np.swapaxes(factor, -1, -2), dtype=np.float64)
     except np.linalg.LinAlgError:
         lowest = float(np.linalg.eigvalsh((metric + flipped) / 2).min())
         raise ValueError(

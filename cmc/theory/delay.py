@@ -140,29 +140,6 @@ def class_gain(loop: LagLoop, delay: ArrayLike) -> Array:
     return np.where(lowest < 0.0, -1.0 / np.minimum(lowest, -1e-300), np.inf)
 
 
-def phase_crossover_gain(loop: LagLoop, delay: float) -> float:
-    """The textbook estimate in continuous time; the hold counts as half a sample of delay.
-
-    Solves atan(w T) - atan(w tau) - w (delay + h / 2) = -pi / 2 for the lowest w, then
-    k = sqrt(1 + (w tau)^2) w T / (gain sqrt(1 + (w T)^2)).
-
-    Raises:
-        ValueError: if `delay` is negative or not finite.
-    """
-    loop.split(delay)
-    late = delay + 0.5 * loop.period
-
-    def phase(w: float) -> float:
-        turned = np.arctan(w * loop.integral_time) - np.arctan(w * loop.tau)
-        return float(turned - w * late + 0.5 * np.pi)
-
-    w = np.geomspace(1e-3, 2.0 * np.pi, 2000) / late  # the phase is below -pi at the upper end
-    first = int(np.flatnonzero([phase(value) < 0.0 for value in w])[0])
-    root = brentq(phase, w[first - 1], w[first])
-    steep = np.hypot(1.0, root * loop.tau) * root * loop.integral_time
-    return float(steep / (loop.gain * np.hypot(1.0, root * loop.integral_time)))
-
-
 def sample_matrix(loop: LagLoop, delay: float, slope: float) -> Array:
     """Matrix of one sample for the state (e_k, I_{k-1}, u_{k-1}, ..., u_{k-d-1})."""
     a, b_new, b_old = loop.weights(delay)
@@ -257,48 +234,3 @@ def decays(
             np.maximum(third, np.abs(error), out=third)
     # A sustained oscillation has equal peaks up to where the samples happen to fall
     return (fourth < 0.99 * third) | (fourth < 1e-9)
-
-
-@dataclass(frozen=True)
-class DelayMap:
-    """Stability over a grid of delays (columns) and slopes (rows), predicted and measured."""
-
-    delays: Array
-    """Delays in s, ascending, (columns,)."""
-    slopes: Array
-    """Slopes of the policy, ascending, (rows,)."""
-    predicted: NDArray[np.bool_]
-    """`spectral_radius` < 1, (rows, columns)."""
-    measured: NDArray[np.bool_]
-    """`decays`, (rows, columns)."""
-    boundary: Array
-    """`largest_gain` at each delay, (columns,)."""
-    guaranteed: Array
-    """`class_gain` at each delay, (columns,)."""
-
-    def gaps(self) -> NDArray[np.int64]:
-        """Rows between the predicted and the measured boundary in each column."""
-        return np.abs(self.predicted.sum(axis=0) - self.measured.sum(axis=0))
-
-    def share_within_one_cell(self) -> float:
-        """Share of cells whose measured verdict is predicted there or one row above or below."""
-        padded = np.pad(self.predicted, ((1, 1), (0, 0)), mode="edge")
-        near = np.stack([padded[:-2], padded[1:-1], padded[2:]])
-        return float((near == self.measured).any(axis=0).mean())
-
-
-def delay_map(
-    loop: LagLoop, delays: ArrayLike, slopes: ArrayLike, *, steps: int = 2000
-) -> DelayMap:
-    """Predict and measure the stability of `loop` on a grid.
-
-    Args:
-        loop: the lag and its sampling.
-        delays: s, ascending, one per column.
-        slopes: ascending, one per row.
-        steps: samples of each simulation.
-    """
-    x, y = np.atleast_1d(np.asarray(delays, float)), np.atleast_1d(np.asarray(slopes, float))
-    predicted = np.array([[spectral_radius(loop, late, k) < 1.0 for late in x] for k in y])
-    measured = decays(loop, x, y[:, None], steps=steps)
-    return DelayMap(x, y, predicted, measured, largest_gain(loop, x), class_gain(loop, x))

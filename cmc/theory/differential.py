@@ -18,6 +18,31 @@ from cmc.theory.auxiliary import AuxiliarySpace, inverse
 from cmc.theory.spectrum import Array, checked_square
 
 
+def loop_jacobian(Lambda: ArrayLike, R: ArrayLike, p: ArrayLike, q: ArrayLike) -> Array:
+    """Jacobian [[Lambda + R P, R Q], [I, 0]] of the loop in (z, int z), (..., 2n, 2n).
+
+    Args:
+        Lambda: Open-loop Jacobian in z, (..., n, n), 1/s.
+        R: Gain of the auxiliary command, (..., n, n).
+        p: Signed slopes dpi_i/dz_i, (..., n).
+        q: Signed slopes dpi_i/d(int z_i), (..., n).
+    """
+    Lambda, R = np.asarray(Lambda, dtype=float), np.asarray(R, dtype=float)
+    p, q = np.asarray(p, dtype=float), np.asarray(q, dtype=float)
+    n = Lambda.shape[-1]
+    if p.shape[-1:] != (n,) or q.shape[-1:] != (n,) or R.shape[-2:] != (n, n):
+        raise ValueError(
+            f"Lambda {Lambda.shape} needs R (..., {n}, {n}) and slopes (..., {n}), "
+            f"got R {R.shape}, p {p.shape}, q {q.shape}"
+        )
+    RP, RQ = R * p[..., None, :], R * q[..., None, :]
+    shape = np.broadcast_shapes(Lambda.shape, RP.shape, RQ.shape)
+    J = np.zeros((*shape[:-2], 2 * n, 2 * n))
+    J[..., :n, :n], J[..., :n, n:] = Lambda + RP, RQ
+    J[..., n:, :n] = np.eye(n)
+    return J
+
+
 class Blocks(NamedTuple):
     """The four blocks of F, each (..., n, n), in 1/s, up to the units of the action."""
 
