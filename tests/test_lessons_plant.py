@@ -75,6 +75,13 @@ def test_01_rates_and_metric_are_those_of_the_plant(name):
         assert "Refused: no metric" in data["text"]
 
 
+@pytest.mark.parametrize("number", ["01", "03"])
+def test_one_signal_is_refused_in_one_line(number):
+    plant = "plant = plants.LinearPlant([[-1.0]], [[2.0]])\ny_star = np.zeros(1)"
+    text = run(number, plant=plant).text
+    assert "Refused: one signal has no neighbor to part from" in text
+
+
 @EVERY
 def test_02_shares_are_those_of_the_plant(name):
     lesson, (f_y, f_u) = answer("02", name), arrays(name)
