@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 from lesson import run
 from scipy.linalg import expm
 
+TESTS = Path(__file__).resolve().parent
 Y_STAR = "\ny_star = np.zeros(plant.n)"
 PLANTS = {
     "real": ([[-1.0, 0.3], [0.0, -2.0]], [[1.0, 0.2], [0.1, 1.0]]),
@@ -187,3 +191,17 @@ def test_04_transforms_and_floors_are_those_of_the_plant(name):
     np.testing.assert_allclose(space["floor"], wanted, atol=1e-9)
     for factor, decays in ((0.98, False), (1.02, True)):
         assert (largest(space["loop"](factor * wanted.max())) < 0) == decays
+
+
+@pytest.mark.parametrize("number", ["01", "02", "03", "04"])
+def test_the_lesson_needs_neither_torch_nor_mujoco(number):
+    """Every cell runs where both are absent."""
+    code = f"""
+import sys
+sys.modules["torch"] = sys.modules["mujoco"] = None
+sys.path.insert(0, {str(TESTS)!r})
+from lesson import run
+run({number!r})
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
