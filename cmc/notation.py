@@ -47,14 +47,7 @@ class Table(str):
 
 
 def table(*sections: str) -> Table:
-    """Return the notation as a Markdown table that a notebook renders.
-
-    Args:
-        sections: which sections; all of them by default.
-
-    Raises:
-        ValueError: if there is no such section.
-    """
+    """Return the notation, or some of its sections, as a Markdown table."""
     there = list(dict.fromkeys(s.section for s in symbols()))
     unknown = set(sections) - set(there)
     if unknown:

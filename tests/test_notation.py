@@ -38,7 +38,10 @@ def find(where: str):
 
 
 @pytest.mark.parametrize("symbol", SYMBOLS, ids=lambda s: s.where)
-def test_every_name_is_in_the_code(symbol):
+def test_every_row_is_complete_and_its_name_is_in_the_code(symbol):
+    assert all((symbol.symbol, symbol.name, symbol.shape, symbol.unit, symbol.meaning))
+    assert "|" not in symbol.symbol + symbol.meaning + symbol.unit
+    assert symbol.symbol.count("{") == symbol.symbol.count("}")
     path, _, argument = symbol.where.removesuffix(")").partition("(")
     found = find(path)
     if argument:
@@ -48,20 +51,10 @@ def test_every_name_is_in_the_code(symbol):
         assert path.rsplit(".", 1)[-1] in (symbol.name, f"to_{symbol.name}")
 
 
-def test_every_equation_is_one_of_the_papers():
+def test_one_name_has_one_meaning_and_every_equation_is_one_of_the_papers():
     assert {s.equation for s in SYMBOLS} - {""} <= LABELS
-
-
-def test_one_name_one_meaning():
     names = [s.name for s in SYMBOLS]
     assert len(set(names)) == len(names)
-
-
-@pytest.mark.parametrize("symbol", SYMBOLS, ids=lambda s: s.where)
-def test_every_row_is_complete(symbol):
-    assert all((symbol.symbol, symbol.name, symbol.shape, symbol.unit, symbol.meaning))
-    assert "|" not in symbol.symbol + symbol.meaning + symbol.unit
-    assert symbol.symbol.count("{") == symbol.symbol.count("}")
 
 
 def test_the_table_renders_every_row():

@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 
-from cmc.theory.auxiliary import (
-    AuxiliarySpace,
-    ComplexEigenvalueError,
-    DefectiveMatrixError,
-    SingularInputError,
-    decompose,
-)
+from cmc.theory.auxiliary import AuxiliarySpace, decompose
+from cmc.theory.explicit import ComplexEigenvalueError, DefectiveMatrixError, SingularInputError
 
 F_Y = np.array([[-2.0, 1.0], [0.5, -1.0]])
 F_U = np.array([[1.0, 2.0], [1.5, 1.0]])
@@ -52,15 +47,18 @@ def test_structure_on_twenty_thousand_random_systems(n):
     np.testing.assert_allclose(space.eigenvalues, expected, atol=1e-6)
 
 
-def test_one_system_equals_its_row_in_a_batch():
-    for n in (2, 4):
-        f_y, f_u, _ = random_systems(n, 300, seed=3)
-        batch = decompose(f_y, f_u)
-        for k in range(len(f_y)):
-            one = decompose(f_y[k], f_u[k])
-            for name in ("T_y", "T_a", "Lambda", "R"):
-                wanted = getattr(batch, name)[k]
-                np.testing.assert_allclose(getattr(one, name), wanted, rtol=1e-8, atol=1e-9)
+@pytest.mark.parametrize("n", [2, 4])
+def test_one_system_equals_its_row_in_a_batch(n):
+    f_y, f_u, _ = random_systems(n, 300, seed=3)
+    batch = decompose(f_y, f_u)
+    for k in range(len(f_y)):
+        one = decompose(f_y[k], f_u[k])
+        for name in ("T_y", "T_a", "Lambda", "R"):
+            wanted = getattr(batch, name)[k]
+            np.testing.assert_allclose(getattr(one, name), wanted, rtol=1e-8, atol=1e-9)
+    wide = decompose(np.broadcast_to(f_y[0], (4, 3, n, n)), f_u[0])  # batch axes broadcast
+    assert wide.R.shape == (4, 3, n, n)
+    np.testing.assert_allclose(wide.R[2, 1], batch.R[0], rtol=1e-8, atol=1e-9)
 
 
 def test_closed_form_agrees_with_lapack_where_two_by_two_sits_in_three_by_three():
@@ -89,13 +87,7 @@ def test_a_change_of_latent_coordinates_changes_neither_eigenvalues_nor_the_loop
     np.testing.assert_allclose(np.abs(ratio[..., 0]), after.gains / before.gains, rtol=1e-4)
 
 
-def test_batch_axes_broadcast():
-    space = decompose(np.broadcast_to(F_Y, (4, 3, 2, 2)), F_U)
-    assert space.R.shape == (4, 3, 2, 2)
-    np.testing.assert_allclose(space.R[2, 1], decompose(F_Y, F_U).R)
-
-
-def test_scalar_systems_and_multiples_of_the_identity():
+def test_scalar_systems_multiples_of_the_identity_and_integers():
     space = decompose([[-3.0]], [[-2.0]])
     assert space.eigenvalues.tolist() == [-3.0]
     assert space.gains.tolist() == [2.0]
@@ -104,6 +96,8 @@ def test_scalar_systems_and_multiples_of_the_identity():
     np.testing.assert_allclose(np.tril(F_U @ same.T_a, -1), 0.0, atol=1e-14)
     many = decompose(np.stack([-2.0 * np.eye(2), F_Y]), F_U)
     np.testing.assert_allclose(many.T_y[0], np.eye(2))
+    whole = decompose(np.array([[-2, 1], [1, -3]]), np.eye(2, dtype=int))
+    np.testing.assert_allclose(whole.Lambda, decompose([[-2.0, 1], [1, -3]], np.eye(2)).Lambda)
 
 
 def test_repeated_eigenvalues_with_enough_eigenvectors_are_no_error():
@@ -124,110 +118,91 @@ def test_signals_map_there_and_back():
     # y' = f_y y + f_u u becomes z' = Lambda z + R a
     z_dot = space.to_z(y @ F_Y.T + space.to_u(a) @ F_U.T)
     np.testing.assert_allclose(z_dot, space.to_z(y) @ space.Lambda.T + a @ space.R.T)
+    still = AuxiliarySpace.identity(F_Y, F_U)
+    np.testing.assert_array_equal([still.Lambda, still.R], [F_Y, F_U])
 
 
-def test_identity_transforms_leave_the_jacobians():
-    space = AuxiliarySpace.identity(F_Y, F_U)
-    np.testing.assert_array_equal(space.Lambda, F_Y)
-    np.testing.assert_array_equal(space.R, F_U)
-
-
-COMPLEX_2 = np.array([[-0.4, 2.0], [-2.0, -0.4]])
-COMPLEX_3 = np.array([[-0.4, 2.0, 0.0], [-2.0, -0.4, 0.0], [0.3, 0.1, -1.0]])
+PAIR = np.array([[-0.4, 2.0], [-2.0, -0.4]])
+PAIR_3 = np.array([[-0.4, 2.0, 0.0], [-2.0, -0.4, 0.0], [0.3, 0.1, -1.0]])
 JORDAN_3 = np.array([[-1.0, 1.0, 0.0], [0.0, -1.0, 1.0], [0.0, 0.0, -1.0]])
-
-
-@pytest.mark.parametrize("f_y", [COMPLEX_2, COMPLEX_3, np.stack([F_Y, COMPLEX_2])])
-def test_a_complex_pair_names_the_feedback_combination(f_y):
-    with pytest.raises(ComplexEigenvalueError, match=r"-0\.4 \+- 2j.*feedback combination"):
-        decompose(f_y, np.eye(f_y.shape[-1]))
-
-
-def test_a_batch_says_where():
-    with pytest.raises(ComplexEigenvalueError, match=r"at index 1 \(1 of 3\)"):
-        decompose(np.stack([F_Y, COMPLEX_2, F_Y]), F_U)
-    with pytest.raises(SingularInputError, match=r"at index 2 \(1 of 3\)"):
-        decompose(F_Y, np.stack([F_U, F_U, np.ones((2, 2))]))
-
-
-@pytest.mark.parametrize(
-    "f_y", [np.array([[-1.0, 1.0], [0.0, -1.0]]), JORDAN_3, np.array([[F_Y, [[-1, 0], [3, -1]]]])]
-)
-def test_defective_matrices(f_y):
-    with pytest.raises(DefectiveMatrixError, match="Schur"):
-        decompose(f_y, np.eye(f_y.shape[-1]))
-
-
-def test_defective_up_to_rounding():
-    rng = np.random.default_rng(1)
-    for n in (2, 3):
-        for _ in range(20):
-            V = np.eye(n) + 0.3 * rng.normal(size=(n, n))
-            jordan = -np.eye(n) + np.diag(np.ones(n - 1), 1)
-            with pytest.raises(DefectiveMatrixError):
-                decompose(V @ jordan @ np.linalg.inv(V), np.eye(n))
-
-
-@pytest.mark.parametrize("n", [2, 3])
-@pytest.mark.parametrize("batch", [False, True])
-def test_singular_input(n, batch):
-    f_u = np.eye(n)
-    f_u[-1] = 0.0  # a peg out of contact: no command moves the force
-    f_y = -np.diag(np.arange(1.0, n + 1))
-    with pytest.raises(SingularInputError, match="singular"):
-        decompose(f_y[None] if batch else f_y, f_u)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("n", [2, 3])
-def test_not_finite(bad, n):
-    f_y, f_u = -np.diag(np.arange(1.0, n + 1)), np.eye(n)
-    for i in range(n):
-        for j in range(n):
-            broken = f_y.copy()
-            broken[i, j] = bad
-            with pytest.raises(ValueError, match="f_y must be finite"):
-                decompose(broken, f_u)
-            broken = f_u.copy()
-            broken[i, j] = bad
-            with pytest.raises(ValueError, match="f_u must be finite"):
-                decompose(f_y, broken)
+OUT = np.diag([1.0, 0.0])  # a peg out of contact: no command moves the force
+COMPLEX = ComplexEigenvalueError, r"-0\.4 \+- 2j.*feedback combination"
+DEFECTIVE = DefectiveMatrixError, "Schur"
 
 
 @pytest.mark.parametrize(
     ("f_y", "f_u", "error", "words"),
     [
-        (np.ones(4), np.eye(2), ValueError, r"\(\.\.\., n, n\), got \(4,\)"),
+        (PAIR, np.eye(2), *COMPLEX),
+        (PAIR_3, np.eye(3), *COMPLEX),
+        (np.stack([F_Y, PAIR]), np.eye(2), *COMPLEX),
+        (np.stack([F_Y, PAIR, F_Y]), F_U, ComplexEigenvalueError, r"at index 1 \(1 of 3\)"),
+        (np.array([[-1.0, 1.0], [0.0, -1.0]]), np.eye(2), *DEFECTIVE),
+        (JORDAN_3, np.eye(3), *DEFECTIVE),
+        (np.array([[F_Y, [[-1, 0], [3, -1]]]]), np.eye(2), *DEFECTIVE),
+        (F_Y, OUT, SingularInputError, "singular"),
+        (F_Y[None], OUT, SingularInputError, "singular"),
+        (np.diag([-1.0, -2, -3]), np.diag([1.0, 1, 0]), SingularInputError, "singular"),
+        (F_Y, np.stack([F_U, F_U, OUT]), SingularInputError, r"at index 2 \(1 of 3\)"),
+        (np.ones(4), np.eye(2), ValueError, r"\(\.\.\., n, n\), got shape \(4,\)"),
         (np.ones((2, 3)), np.eye(2), ValueError, "n, n"),
-        (-np.eye(3), np.eye(2), ValueError, "one size"),
+        (-np.eye(3), np.eye(2), ValueError, r"f_u needs shape \(\.\.\., 3, 3\)"),
+        (F_Y, np.ones((2, 1)), ValueError, "2 signals and 1 command; .*composite"),
         (np.ones((0, 0)), np.ones((0, 0)), ValueError, "n, n"),
         (np.tile(F_Y, (2, 1, 1)), np.tile(F_U, (3, 1, 1)), ValueError, "broadcast"),
+        (F_Y, 1e300 * F_U, ValueError, "f_y and f_u: too large"),
         (F_Y * 1j, F_U, TypeError, "real numbers"),
         ([["a", "b"], ["c", "d"]], F_U, TypeError, "real numbers"),
+        ([[1.0], [2.0, 3.0]], F_U, TypeError, "f_y needs an array"),
+        (None, F_U, TypeError, "f_y needs real numbers"),
     ],
 )
-def test_wrong_shapes_and_types(f_y, f_u, error, words):
+def test_what_decompose_refuses(f_y, f_u, error, words):
     with pytest.raises(error, match=words):
         decompose(f_y, f_u)
 
 
-def test_integer_matrices_are_welcome():
-    np.testing.assert_allclose(
-        decompose(np.array([[-2, 1], [1, -3]]), np.eye(2, dtype=int)).Lambda,
-        decompose([[-2.0, 1.0], [1.0, -3.0]], np.eye(2)).Lambda,
-    )
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("n", [2, 3])
+def test_not_finite(bad, n):
+    good = (-np.diag(np.arange(1.0, n + 1)), np.eye(n))
+    for which, name in enumerate(("f_y", "f_u")):
+        for at in np.ndindex(n, n):
+            broken = [matrix.copy() for matrix in good]
+            broken[which][at] = bad
+            with pytest.raises(ValueError, match=f"{name} needs finite"):
+                decompose(*broken)
 
 
-def test_the_constructor_refuses_what_does_not_fit():
-    eye = np.eye(2)
-    with pytest.raises(ValueError, match="one shape"):
-        AuxiliarySpace(eye, eye, eye, np.eye(3))
-    with pytest.raises(ValueError, match="finite"):
-        AuxiliarySpace(eye, eye, eye * np.nan, eye)
-    with pytest.raises(ValueError, match="fit together"):
-        AuxiliarySpace.from_transforms(eye, eye, F_Y, np.eye(3))
+@pytest.mark.parametrize("n", [2, 3])
+def test_defective_up_to_rounding(n):
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        V = np.eye(n) + 0.3 * rng.normal(size=(n, n))
+        jordan = -np.eye(n) + np.diag(np.ones(n - 1), 1)
+        with pytest.raises(DefectiveMatrixError):
+            decompose(V @ jordan @ np.linalg.inv(V), np.eye(n))
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda eye: AuxiliarySpace(eye, eye, eye, np.eye(3)), "one shape"),
+        (lambda eye: AuxiliarySpace(eye, eye, eye * np.nan, eye), "Lambda needs finite"),
+        (lambda eye: AuxiliarySpace.from_transforms(eye, eye, F_Y, np.eye(3)), "f_u needs shape"),
+        (lambda eye: AuxiliarySpace.from_transforms(0 * eye, eye, F_Y, F_U), "T_y .*invertible"),
+        (lambda eye: AuxiliarySpace.identity(3.0, eye), "f_y needs shape"),
+        (lambda eye: decompose(F_Y, F_U).to_z([1.0]), r"y needs shape \(\.\.\., 2\)"),
+        (lambda eye: decompose(F_Y, F_U).to_u(["a", "b"]), "a needs real numbers"),
+        (lambda eye: decompose(F_Y, F_U).signed([1.0, 2, 3], 1.0), "fit together"),
+        (lambda eye: decompose(F_Y, F_U).loop(np.ones(2)), "slopes needs shape"),
+    ],
+)
+def test_the_space_names_what_does_not_fit(call, words):
+    with pytest.raises((ValueError, TypeError), match=words):
+        call(np.eye(2))
     with pytest.raises(AttributeError):
-        decompose(F_Y, F_U).R = eye
+        decompose(F_Y, F_U).R = np.eye(2)
 
 
 @pytest.mark.parametrize(

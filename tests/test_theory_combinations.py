@@ -6,27 +6,21 @@ import torch
 
 from cmc import plants
 from cmc.policies import PositiveNetwork
-from cmc.theory.auxiliary import (
-    AuxiliarySpace,
-    ComplexEigenvalueError,
-    DefectiveMatrixError,
-    SingularInputError,
-    decompose,
-)
+from cmc.theory.auxiliary import AuxiliarySpace, decompose
 from cmc.theory.certificates import rate_in
 from cmc.theory.certify import certify
 from cmc.theory.combinations import (
     block_schur,
-    coupling_skewness,
     feedback,
     feedback_gain,
     possible_combinations,
     real_block_form,
     schur,
 )
-from cmc.theory.differential import F, subsystems
-from cmc.theory.jacobians import differences
-from cmc.theory.margins import slope_floor, symmetric_bound, theorem2_margin
+from cmc.theory.contraction import F, contraction_rate, subsystems
+from cmc.theory.explicit import ComplexEigenvalueError, DefectiveMatrixError, SingularInputError
+from cmc.theory.identification import differences
+from cmc.theory.margins import slope_floor, theorem2_margin
 from cmc.theory.simulate import Loop
 
 
@@ -41,6 +35,13 @@ def random_spirals(number, seed=0, real=(-5.0, -0.05)):
     return f_y[keep], f_u[keep], s[keep], w[keep]
 
 
+def coupling_skewness(space, slopes):
+    """Largest entry of F_ij + F_ji^T, i != j: zero where the coupling is skew."""
+    parts, off = subsystems(F(space, slopes)), ~np.eye(space.n, dtype=bool)
+    mirrored = np.moveaxis(parts, (-4, -3, -2, -1), (-3, -4, -1, -2))
+    return np.abs((parts + mirrored)[..., off, :, :]).max(axis=(-3, -2, -1), initial=0.0)
+
+
 def test_the_block_form_is_skew_and_contracting_on_twenty_thousand_plants():
     f_y, f_u, s, w = random_spirals(20_400)
     assert len(f_y) > 20_000
@@ -49,7 +50,7 @@ def test_the_block_form_is_skew_and_contracting_on_twenty_thousand_plants():
     # from the transforms alone, so that a wrong R or Lambda could not hide
     space = AuxiliarySpace.from_transforms(built.T_y, built.T_a, f_y, f_u)
     assert coupling_skewness(space, slopes).max() < 1e-9
-    assert symmetric_bound(F(space, slopes)).max() < 0.0
+    assert contraction_rate(F(space, slopes)).min() > 0.0
     np.testing.assert_allclose(space.R, built.R, atol=1e-8)
     np.testing.assert_allclose(space.Lambda, built.Lambda, atol=1e-8)
     np.testing.assert_allclose(built.eigenvalues, np.stack([s, s], axis=-1), atol=1e-7)
@@ -138,7 +139,7 @@ def test_block_form_with_slopes_of_the_moment_misjudges_tanh_policies():
             J = np.stack([(rhs(x + d) - rhs(x - d)) / 2e-6 for d in 1e-6 * np.eye(4)], axis=-1)
             s = np.stack([T_y @ x[:2], x[2:]], axis=-1)
             space = feedback(f_y[k], f_u[k], slopes_at(s))
-            assert symmetric_bound(F(space, slopes_at(s))) < 0.0
+            assert contraction_rate(F(space, slopes_at(s))) > 0.0
             frozen_yes_true_no += np.linalg.eigvals(J).real.max() > 1e-3
     assert frozen_yes_true_no > 20
 
@@ -154,7 +155,7 @@ def test_real_and_complex_eigenvalues_may_be_mixed(n):
         space = AuxiliarySpace.from_transforms(built.T_y, built.T_a, f_y, f_u)
         np.testing.assert_allclose(space.Lambda, built.Lambda, atol=1e-8)
         assert coupling_skewness(space, slopes) < 1e-7
-        assert symmetric_bound(F(space, slopes)) < 0.0
+        assert contraction_rate(F(space, slopes)) > 0.0
         assert (np.diff(built.eigenvalues) <= 1e-12).all()
 
 
@@ -200,50 +201,48 @@ def test_schur_is_a_hierarchy_without_eigenvectors():
         assert np.abs(parts[np.tril_indices(3, -1)]).max() < 1e-12
         assert np.linalg.eigvals(F(space, slopes)).real.max() < 0.0
         assert (built.gains > 0.0).all()
-    with pytest.raises(ValueError, match="one system"):
-        schur(np.stack([jordan, jordan]), np.eye(3))
 
 
-def answers(f_y, f_u):
-    found = {p.name: p for p in possible_combinations(f_y, f_u)}
-    assert all(p.reason for p in found.values())
-    return [found[name].possible for name in found], found
+F_U = np.array([[1.0, 0.3], [-0.5, 1.2]])
+REAL, PAIR = np.array([[-2.0, 1.0], [0.5, -1.0]]), np.array([[-0.4, 2.0], [-2.0, -0.4]])
+JORDAN = np.array([[-1.0, 1.0], [0.0, -1.0]])
 
 
-def test_possible_combinations():
-    f_u = np.array([[1.0, 0.3], [-0.5, 1.2]])
-    real, spiral = np.array([[-2.0, 1.0], [0.5, -1.0]]), np.array([[-0.4, 2.0], [-2.0, -0.4]])
-    assert answers(real, f_u)[0] == [True] * 5
-    assert answers(spiral, f_u)[0] == [False, False, True, True, True]
-    assert answers(np.array([[-1.0, 1.0], [0.0, -1.0]]), f_u)[0] == [
-        False,
-        True,
-        False,
-        False,
-        True,
-    ]
-    flags, found = answers(spiral + np.eye(2), f_u)
-    assert flags == [False, False, True, False, True]
-    assert "0.6" in found["feedback (policies)"].reason
-    flags, found = answers(real, np.ones((2, 2)))
-    assert flags == [False] * 5
-    assert "singular" in found["schur"].reason
-    with pytest.raises(ValueError, match="one plant"):
-        possible_combinations(np.stack([real, real]), f_u)
+@pytest.mark.parametrize(
+    ("f_y", "f_u", "flags", "name", "words"),
+    [
+        (REAL, F_U, "yyyyy", "hierarchical", "one way"),
+        (PAIR, F_U, "nnyyy", "hierarchical", "complex pair"),
+        (JORDAN, F_U, "nynny", "hierarchical", "Schur"),
+        (PAIR + np.eye(2), F_U, "nnyny", "feedback (policies)", "0.6"),
+        (REAL, np.ones((2, 2)), "nnnnn", "schur", "singular"),
+    ],
+)
+def test_possible_combinations(f_y, f_u, flags, name, words):
+    found = possible_combinations(f_y, f_u)
+    assert "".join("ny"[option.possible] for option in found) == flags
+    assert words in {option.name: option.reason for option in found}[name]
+    assert all(option.reason for option in found)
 
 
-def test_errors():
-    spiral = np.array([[-0.4, 2.0], [-2.0, -0.4]])
-    with pytest.raises(DefectiveMatrixError):
-        feedback([[-1.0, 1.0], [0.0, -1.0]], np.eye(2))
-    with pytest.raises(SingularInputError):
-        feedback(spiral, np.ones((2, 2)))
-    with pytest.raises(ValueError, match="negative"):
-        feedback(spiral, np.eye(2), np.array([[-1.0, -1.0], [-1.0, 0.5]]))
-    with pytest.raises(ValueError, match="finite"):
-        feedback(spiral * np.nan, np.eye(2))
-    with pytest.raises(ValueError, match="slopes"):
-        feedback(spiral, np.eye(2), np.ones(2))
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (lambda: feedback(JORDAN, np.eye(2)), DefectiveMatrixError, "Schur"),
+        (lambda: feedback(PAIR, np.ones((2, 2))), SingularInputError, "singular"),
+        (lambda: feedback(PAIR, np.eye(2), [[-1.0, -1.0], [-1.0, 0.5]]), ValueError, "negative"),
+        (lambda: feedback(PAIR * np.nan, np.eye(2)), ValueError, "f_y needs finite"),
+        (lambda: feedback(PAIR, np.eye(2), np.ones(2)), ValueError, "slopes needs shape"),
+        (lambda: feedback_gain(PAIR, -np.ones((3, 2))), ValueError, r"\(\.\.\., 2, 2\)"),
+        (lambda: real_block_form("a"), TypeError, "f_y needs real numbers"),
+        (lambda: schur([REAL, REAL], F_U), ValueError, r"f_y needs shape \(n, n\)"),
+        (lambda: block_schur(REAL, [F_U, F_U]), ValueError, r"f_u needs shape \(2, 2\)"),
+        (lambda: possible_combinations([REAL, REAL], F_U), ValueError, r"shape \(n, n\)"),
+    ],
+)
+def test_errors(call, error, words):
+    with pytest.raises(error, match=words):
+        call()
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 6])

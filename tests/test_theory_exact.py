@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from test_theory_certify import policy
+from test_theory_certify import policy, ratio
 
 from cmc import plants
 from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.certify import certify
-from cmc.theory.contraction import rate_from_cloud
 from cmc.theory.exact import Region
-from cmc.theory.jacobians import differences
+from cmc.theory.identification import differences
 from cmc.theory.simulate import Loop, closed_loop
 
 
@@ -79,8 +78,7 @@ def test_exact_certificate_of_a_nonlinear_plant_is_obeyed():
     path = closed_loop(plant, pol, start[:, :2], times, integral=start[:, 2:])
     paths = np.concatenate([path.y, path.integral], axis=-1)
     assert np.abs(paths).max() < 0.3
-    measured = rate_from_cloud(times, paths, answer.metric)
-    assert (measured.ratio <= np.exp(-answer.rate * times) * (1 + 1e-6)).all()
+    assert (ratio(paths, answer.metric) <= np.exp(-answer.rate * times) * (1 + 1e-6)).all()
     sampled = certify(pol, plant, region=region, kind="exact", h=0.02)
     assert sampled
     assert (sampled.kind, sampled.domain) == ("exact", "sampled")

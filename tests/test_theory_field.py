@@ -252,3 +252,21 @@ def test_the_ball_keeps_trajectories_and_commands_inside():
         (np.concatenate([path.z, path.integral], -1) - answer.rest) @ theta.T, axis=-1
     )
     assert (far <= answer.ball * np.exp(-answer.rate * t)[:, None] * (1 + 1e-6)).all()
+
+
+def test_slopes_are_probed_in_the_units_in_which_they_vary():
+    """tanh is flat but within 1e-5 of int z = 0: what was stated is too little there."""
+
+    class Narrow:
+        def pi(self, s):
+            x = s / [1e-2, 1e-7]
+            return (
+                0.15 * x[..., 0] + 0.03 * x[..., 1] + np.tanh(0.05 * x[..., 0] + 0.02 * x[..., 1])
+            )
+
+        def slope_bounds(self):
+            return np.array([[15.0, 3e5]]), 0.9 * np.array([[20.0, 5e5]])
+
+    answer = certify(Narrow(), plants.LinearPlant([[-1.5e5]], [[474.0]]))
+    assert answer.refused
+    assert "its slopes reach" in answer.reason

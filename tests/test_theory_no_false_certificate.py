@@ -3,42 +3,37 @@
 import numpy as np
 import pytest
 
-from benchmarks.false_certificates import KINDS, ask, draw, falsehood
+from benchmarks.false_certificates import falsehood
+from benchmarks.questions import KINDS, draw
 
 
-def seeds(kind, count, most=3):
-    """The first trials of a kind with at most `most` signals."""
-    found = []
-    for seed in range(10_000):
-        trial = draw(seed)
-        if trial.kind == kind and trial.plant.n <= most:
-            found.append(seed)
-        if len(found) == count:
-            return found
-    raise AssertionError(f"no {count} trials of {kind}")
+def question(kind, seed):
+    """A small question of a kind, and its answer."""
+    if "SB3" in kind:
+        pytest.importorskip("stable_baselines3")
+    trial = draw(seed, kind)
+    return trial, trial.ask()
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_certificate_is_contradicted(kind):
     held = 0
-    for seed in seeds(kind, 3):
-        trial = draw(seed)
-        answer = ask(trial)
+    for seed in (0, 3, 6, 11):
+        trial, answer = question(kind, seed)
         held += answer.holds
         if answer.holds:
             assert falsehood(trial, answer, np.random.default_rng([seed, 1])) == "", (seed, answer)
         else:
             assert answer.reason
-    if kind == "linear, real modes":
-        assert held >= 2
+    assert bool(held) == (kind not in ("coupled policy", "slip in a Jacobian"))
 
 
 def test_the_check_finds_a_certificate_that_is_false():
     """A rate that is too good, or a sign that is not looked at, must be noticed."""
-    seed = seeds("linear, real modes", 1)[0]
-    trial = draw(seed)
-    answer = ask(trial)
-    assert answer.holds
+    for seed in range(9):
+        trial, answer = question("linear, real modes", seed)
+        if answer.holds:
+            break
     object.__setattr__(answer, "rate", 30 * answer.rate)
     assert falsehood(trial, answer, np.random.default_rng(0)) != ""
     object.__setattr__(answer, "rate", answer.rate / 30)

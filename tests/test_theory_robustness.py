@@ -1,21 +1,22 @@
+"""Error balls, ellipsoids and the metric of a model, against simulation and closed forms."""
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_continuous_lyapunov
 
-from cmc.theory.certificates import circle_criterion
-from cmc.theory.contraction import contraction_factor, contraction_rate
-from cmc.theory.disturbance import (
+from cmc.theory.certificates import circle_criterion, common_metric
+from cmc.theory.contraction import contraction_rate
+from cmc.theory.robustness import (
     KINDS,
+    ErrorBall,
+    nominal_metric,
     peak_gain,
     random_disturbances,
-    worst_constant,
-    worst_signal,
+    reach,
+    signal_length,
 )
-from cmc.theory.reach import reach, shape_metric
-from cmc.theory.robustness import ErrorBall, paper_channel, respond
 
 PUSH = np.array([[1.0], [0.0]])  # a disturbance moves z, not its integral
 
@@ -34,38 +35,54 @@ def random_ball(rng, J, B):
     return ErrorBall(metric, float(contraction_rate(J, metric)), B)
 
 
-def tanh_loop(c, low, high):
-    """z' = -c z - [low I + (high - low) tanh I], I' = z: slopes in [low, high]."""
-
-    def rhs(t, s):
-        z, total = s[..., 0], s[..., 1]
-        pull = low * total + (high - low) * np.tanh(total)
-        return np.stack([-c * z - pull, z], axis=-1)
-
-    return rhs
+def tanh_loop(s):
+    """z' = -2 z - [0.8 I + 1.6 tanh I], I' = z: slopes in [0.8, 2.4]."""
+    z, total = s[..., 0], s[..., 1]
+    return np.stack([-2.0 * z - 0.8 * total - 1.6 * np.tanh(total), z], axis=-1)
 
 
-def test_bound_contains_all_of_ten_thousand_disturbed_nonlinear_trajectories():
-    rng, size = np.random.default_rng(0), 0.7
-    times = np.linspace(0.0, 8.0, 321)
-    rhs, ball = tanh_loop(2.0, 0.8, 2.4), ErrorBall.of(circle_criterion(2.0, 0.8, 2.4), PUSH)
-    d = random_disturbances(rng, 320, 10_000, size, step=0.025)
-    first, second = rng.normal(size=(2, 10_000, 2))
-    second[:5000] = first[:5000]  # half of the pairs start together
-    calm = respond(rhs, first, times, np.zeros((320, 1, 1)) * PUSH[:, 0] + np.zeros_like(first))
-    disturbed = respond(rhs, second, times, d @ PUSH.T)
-    distance = ball.distance(disturbed - calm)
-    bound = ball.bound(times[:, None], distance[0], size)
-    assert (distance <= bound * (1 + 1e-9) + 1e-12).all()
-    euclidean = np.linalg.norm(disturbed - calm, axis=-1)
-    assert (euclidean <= ball.euclidean_bound(times[:, None], distance[0], size) + 1e-12).all()
-    output = np.abs(disturbed - calm)[..., 0]
-    assert (
-        output <= ball.output_bound([1.0, 0.0], times[:, None], distance[0], size) + 1e-12
-    ).all()
+def respond(start, times, pushes):
+    """Path of `tanh_loop` under pushes (steps, batch, 2), each held over its step."""
+    path, h = [start], times[1] - times[0]
+    for w in pushes:  # Runge and Kutta, order 4
+        s = path[-1]
+        a = tanh_loop(s) + w
+        b = tanh_loop(s + h / 2 * a) + w
+        c = tanh_loop(s + h / 2 * b) + w
+        path.append(s + h / 6 * (a + 2 * b + 2 * c + tanh_loop(s + h * c) + w))
+    return np.array(path)
+
+
+@pytest.fixture(scope="module")
+def disturbed():
+    """2,000 pairs of trajectories, one of each disturbed; half of the pairs start together."""
+    rng, times = np.random.default_rng(0), np.linspace(0.0, 8.0, 321)
+    d = random_disturbances(rng, 320, 2000, 0.7, step=0.025)
+    first, second = rng.normal(size=(2, 2000, 2))
+    second[:1000] = first[:1000]
+    return times, respond(second, times, d @ PUSH.T) - respond(first, times, 0 * d @ PUSH.T)
+
+
+def test_bounds_contain_all_disturbed_nonlinear_trajectories(disturbed):
+    times, apart = disturbed
+    found, size, row = circle_criterion(2.0, 0.8, 2.4), 0.7, [1.0, 0.0]
+    ball, t, slack = ErrorBall.of(found, PUSH), times[:, None], 1 + 1e-9
+    distance = ball.distance(apart)
+    assert (distance <= ball.bound(t, distance[0], size) * slack + 1e-12).all()
+    low, high = np.linalg.eigvalsh(ball.metric)[[0, -1]]  # the paper's form, never below
+    paper = distance[0] / np.sqrt(low) * np.exp(-ball.rate * t)
+    paper = paper + size * np.sqrt(high / low) / ball.rate * (1 - np.exp(-ball.rate * t))
+    assert (ball.bound(t, distance[0], size) / np.sqrt(low) <= paper * slack).all()
+    assert (np.linalg.norm(apart, axis=-1) <= paper + 1e-12).all()
+    assert (np.abs(apart[..., 0]) <= ball.output_bound(row, t, distance[0], size) + 1e-12).all()
     # a bound that nothing comes near would pass too: the worst of them uses a third of it
-    late = distance[-1] / ball.radius(size)
-    assert 0.3 < late.max() <= 1.0
+    assert 0.3 < distance[-1].max() / ball.radius(size) <= 1.0
+    # the ellipsoid, from a common start
+    corners = np.array([[[-2.0, -k], [1.0, 0.0]] for k in (0.8, 2.4)])
+    ellipsoid = reach(corners, found.metric, PUSH)
+    assert distance[:, :1000].max() <= size * ellipsoid
+    assert ellipsoid <= ball.radius(1.0)
+    assert reach(corners, np.eye(2), PUSH) == np.inf  # it does not contract in this metric
 
 
 def test_sampled_ball_contains_every_trajectory_and_settles_at_its_radius():
@@ -74,7 +91,8 @@ def test_sampled_ball_contains_every_trajectory_and_settles_at_its_radius():
     metric = np.eye(4)
     for _ in range(4000):  # the sum of (rho phi)^T^k (rho phi)^k: a Lyapunov metric by its series
         metric = np.eye(4) + (1.002 * phi).T @ metric @ (1.002 * phi)
-    factor = float(contraction_factor(phi, metric))
+    theta = np.linalg.cholesky(metric).T
+    factor = float(np.linalg.norm(theta @ phi @ np.linalg.inv(theta), 2))
     B = rng.normal(size=(4, 2))
     ball = ErrorBall(metric, -np.log(factor) / h, B, period=h)
     d = random_disturbances(rng, 400, 1000, 0.3, step=h, m=2)
@@ -83,21 +101,8 @@ def test_sampled_ball_contains_every_trajectory_and_settles_at_its_radius():
     for k in range(400):
         assert (ball.distance(states) <= ball.bound(k * h, start, 0.3) * (1 + 1e-9)).all()
         states = states @ phi.T + d[k] @ B.T
-    assert ball.radius(0.3) == pytest.approx(ball.push(0.3) / (1 - factor), rel=1e-9)
-
-
-def test_paper_form_is_the_chung_bound_and_never_below_the_metric_form():
-    rng = np.random.default_rng(2)
-    for _ in range(50):
-        J, B = random_loop(rng), rng.normal(size=(4, 2))
-        ball = random_ball(rng, J, B)
-        low, high = np.linalg.eigvalsh(ball.metric)[[0, -1]]
-        d_bar, t, start = np.linalg.norm(B, 2) * 0.4, 1.3, 2.0
-        fading = np.exp(-ball.rate * t)
-        expected = start / np.sqrt(low) * fading
-        expected += d_bar / ball.rate * np.sqrt(high / low) * (1 - fading)
-        assert ball.euclidean_bound(t, start, 0.4) == pytest.approx(expected)
-        assert ball.bound(t, start, 0.4) / np.sqrt(low) <= expected * (1 + 1e-9)
+    push = 0.3 * np.linalg.norm(ball.theta @ B, 2)
+    assert ball.radius(0.3) == pytest.approx(push / (1 - factor), rel=1e-9)
 
 
 def test_each_promise_is_above_the_next_and_above_what_can_happen():
@@ -105,55 +110,16 @@ def test_each_promise_is_above_the_next_and_above_what_can_happen():
     for _ in range(40):
         J, B, row = random_loop(rng), rng.normal(size=(4, 2)), rng.normal(size=4)
         ball = random_ball(rng, J, B)
-        ellipsoid = reach(J, ball.metric, B)
         peak = peak_gain(J, B, row)
         constant = np.linalg.norm(row @ np.linalg.solve(J, B))
-        sharper = float(ellipsoid.output_bound(row, np.inf, 0.0, 1.0))
+        sharper = signal_length(ball.metric, row) * reach(J, ball.metric, B)
         promised = float(ball.output_bound(row, np.inf, 0.0, 1.0))
         slack = 1 + 1e-6
         assert constant <= peak * slack <= sharper * slack**2
         assert sharper <= promised * 1.002  # `reach` looks at a grid of decays
 
 
-def test_ellipsoid_contains_loops_whose_slopes_change_and_shaping_it_makes_it_smaller():
-    rng, size, row = np.random.default_rng(8), 0.7, [1.0, 0.0]
-    corners = np.array([[[-2.0, -k], [1.0, 0.0]] for k in (0.8, 2.4)])
-    found = circle_criterion(2.0, 0.8, 2.4)
-    plain = reach(corners, found.metric, PUSH)
-    shaped = shape_metric(corners, found.metric, PUSH, row)
-    promise = [float(e.output_bound(row, np.inf, 0.0, size)) for e in (plain, shaped)]
-    assert promise[1] < 0.9 * promise[0]
-    assert promise[1] >= size * max(peak_gain(J, PUSH, row) for J in corners) * (1 - 1e-6)
-    times = np.linspace(0.0, 8.0, 321)
-    d = random_disturbances(rng, 320, 1000, size, step=0.025)
-    first, second = rng.normal(size=(2, 1000, 2))
-    rhs = tanh_loop(2.0, 0.8, 2.4)
-    calm = respond(rhs, first, times, np.zeros((320, 1000, 2)))
-    apart = respond(rhs, second, times, d @ PUSH.T) - calm
-    for ellipsoid in (plain, shaped):
-        distance = ellipsoid.distance(apart)
-        assert (distance <= ellipsoid.bound(times[:, None], distance[0], size) * (1 + 1e-9)).all()
-    with pytest.raises(ValueError, match="does not contract"):
-        shape_metric(corners, np.eye(2), PUSH, row)
-
-
-def test_worst_constant_disturbance_is_the_worst_of_many_and_is_where_the_loop_settles():
-    rng = np.random.default_rng(4)
-    J, B = random_loop(rng), rng.normal(size=(4, 2))
-    ball = random_ball(rng, J, B)
-    for metric in (None, ball.metric):
-        size, d = worst_constant(J, B, metric)
-        assert np.linalg.norm(d) == pytest.approx(1.0)
-        angle = np.linspace(0, np.pi, 2001)
-        others = -np.linalg.solve(J, B @ np.stack([np.cos(angle), np.sin(angle)])).T
-        length = np.linalg.norm(others, axis=-1) if metric is None else ball.distance(others)
-        assert size == pytest.approx(length.max(), rel=1e-5)
-        assert size <= ball.radius(1.0) or metric is None
-    rest = solve_ivp(lambda t, x: J @ x + B @ d, (0, 150), np.zeros(4), rtol=1e-9, atol=1e-12)
-    assert ball.distance(rest.y[:, -1]) == pytest.approx(size, rel=1e-6)
-
-
-def test_peak_gain_of_a_lag_and_of_two_lags_in_closed_form():
+def test_peak_gain_in_closed_form_and_reached_by_its_own_signal():
     assert peak_gain([[-3.0]], [[2.0]], [1.0]) == pytest.approx(2.0 / 3.0, rel=1e-9)
     # an oscillator's impulse response e^{-a t} sin(w t) / w has the absolute integral below
     a, w = 0.1, 2.0
@@ -161,18 +127,16 @@ def test_peak_gain_of_a_lag_and_of_two_lags_in_closed_form():
     expected = 1 / (a**2 + w**2) / np.tanh(np.pi * a / (2 * w))
     assert peak_gain([[-1.0, 1.0], [0.0, -1.0]], [[0.0], [1.0]], [1.0, 0.0]) == pytest.approx(1.0)
     assert peak_gain(J, [[0.0], [1.0]], [1.0, 0.0]) == pytest.approx(expected, rel=1e-4)
-
-
-def test_worst_signal_reaches_the_peak():
     rng = np.random.default_rng(5)
-    J, B, row = random_loop(rng), rng.normal(size=(4, 2)), rng.normal(size=4)
-    times = np.linspace(0.0, 60.0, 6001)
-    signal, reach = worst_signal(J, B, row, times)
-    assert np.linalg.norm(signal, axis=-1).max() == pytest.approx(1.0)
-    path = respond(lambda t, s: s @ J.T, np.zeros((1, 4)), times, (signal @ B.T)[:, None])
-    assert path[-1, 0] @ row == pytest.approx(peak_gain(J, B, row), rel=1e-3)
-    assert reach[-1] == pytest.approx(peak_gain(J, B, row), rel=1e-3)
-    assert (np.diff(reach) >= 0).all()
+    J, B, row, dt = random_loop(rng), rng.normal(size=(4, 2)), rng.normal(size=4), 0.01
+    half, state = expm(dt / 2 * J), np.zeros(4)
+    weights = [row]
+    for _ in range(5999):
+        weights.append(weights[-1] @ half @ half)
+    for weight in reversed(weights):  # along B^T e^{J^T (T - t)} row^T, held over each step
+        d = weight @ half @ B
+        state = half @ (half @ state + dt * B @ d / np.linalg.norm(d))
+    assert row @ state == pytest.approx(peak_gain(J, B, row), rel=1e-3)
 
 
 def test_random_disturbances_are_bounded_and_of_four_kinds():
@@ -188,49 +152,38 @@ def test_random_disturbances_are_bounded_and_of_four_kinds():
     assert abs(np.corrcoef(white[1:, 0], white[:-1, 0])[0, 1]) < 0.2
 
 
-def test_paper_channel_follows_from_the_chain_rule():
-    rng = np.random.default_rng(7)
-    T_y, T_a, p = rng.normal(size=(2, 2)), rng.normal(size=(2, 2)), rng.normal(size=2)
-    d, eps = rng.normal(size=2), 1e-6
-    # u = T_a pi(T_y y): when y moves by eps d, u moves by eps times the lower half
-    moved = T_a @ (np.tanh(p * (T_y @ (eps * d))))
-    np.testing.assert_allclose(paper_channel(T_y, T_a, p) @ d, [*d, *(moved / eps)], rtol=1e-6)
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.9])
+def test_nominal_metric_solves_the_lyapunov_equation_and_judges_real_loops(share):
+    rng = np.random.default_rng(4)
+    J = np.stack([random_loop(rng) for _ in range(20)])
+    for loop, metric in zip(J, nominal_metric(J, share=share), strict=True):
+        b = share * -np.linalg.eigvals(loop).real.max()
+        expected = solve_continuous_lyapunov((loop + b * np.eye(4)).T, -np.eye(4))
+        np.testing.assert_allclose(metric, expected, rtol=1e-7, atol=1e-9)
+        assert contraction_rate(loop, metric) >= b
+        # a real loop that contracts in the model's metric is stable, at least at its rate there
+        real = loop + rng.normal(size=(300, 4, 4)) * rng.uniform(0, 0.5, (300, 1, 1))
+        rate = contraction_rate(real, metric)
+        assert (rate <= -np.linalg.eigvals(real).real.max(axis=-1) + 1e-9).all()
+        # and it does where the error is smaller, in the metric, than the model's own rate
+        theta = np.linalg.cholesky(metric).T
+        size = np.linalg.norm(theta @ (real - loop) @ np.linalg.inv(theta), 2, axis=(-2, -1))
+        small = (
+            loop + (real - loop) * (0.999 * contraction_rate(loop, metric) / size)[:, None, None]
+        )
+        assert (contraction_rate(small, metric) > 0).all()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((np.eye(2), 0.0), "does not contract"),
-        ((np.eye(2), np.nan), "does not contract"),
-        ((-np.eye(2), 1.0), "positive definite"),
-        ((np.ones((2, 3)), 1.0), "shape"),
-        ((np.array([[1.0, 0.5], [0.0, 1.0]]), 1.0), "symmetric"),
-        ((np.eye(2), 1.0, np.ones((3, 1))), "channel"),
-        ((np.eye(2), 1.0, None, -1.0), "period"),
-    ],
-)
-def test_a_ball_of_nonsense_is_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        ErrorBall(*arguments)
-
-
-def test_unstable_loops_and_wrong_sizes_are_refused():
-    for call in (
-        lambda: worst_constant(np.eye(2), np.eye(2)),
-        lambda: peak_gain(np.zeros((2, 2)), np.eye(2), [1.0, 0.0]),
-    ):
-        with pytest.raises(ValueError, match="not stable"):
-            call()
-    with pytest.raises(ValueError, match="at least 0"):
-        ErrorBall(np.eye(2), 1.0).push(-1.0)
-    with pytest.raises(TypeError, match="row needs real numbers"):
-        shape_metric(-np.eye(2), np.eye(2), np.eye(2), "abc")
-    with pytest.raises(ValueError, match="channel needs shape"):
-        peak_gain(-np.eye(2), np.eye(3), [1.0, 0.0])
-    with pytest.raises(ValueError, match="one per step"):
-        respond(lambda t, s: -s, np.zeros((1, 2)), [0.0, 1.0, 2.0], np.zeros((3, 1, 2)))
-    with pytest.raises(ValueError, match="steps needs"):
-        random_disturbances(np.random.default_rng(0), 0, 1, 1.0, step=0.1)
+def test_a_metric_made_for_all_models_passes_all_of_them():
+    # lag with tau in [0.5, 1.5] and gain in [1, 2] times the nominal: four corners, one metric
+    corners = [
+        [[-(1 + 0.5 * gain) / tau, -2.0 * gain / tau], [1.0, 0.0]]
+        for tau in (0.5, 1.5)
+        for gain in (1.0, 2.0)
+    ]
+    found = common_metric(corners)
+    assert found
+    assert contraction_rate(corners, found.metric).min() == pytest.approx(found.rate)
 
 
 def test_ball_of_a_certificate_takes_its_metric_and_its_rate():
@@ -243,9 +196,37 @@ def test_ball_of_a_certificate_takes_its_metric_and_its_rate():
     assert not boxed.fits(1.01 * edge)
     np.testing.assert_allclose(ball.metric, found.metric)
     assert ball.rate == found.rate > 0
-    with pytest.raises(ValueError, match="without a certificate"):
-        ErrorBall.of(circle_criterion(0.1, 0.8, 2.4))
-    with pytest.raises(ValueError, match="frozen"):
-        ErrorBall.of(replace(found, kind="frozen"))
-    with pytest.raises(ValueError, match="does not go with"):
-        ErrorBall.of(found, period=0.01)
+
+
+EYE, FOUND = np.eye(2), circle_criterion(2.0, 0.8, 2.4)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ErrorBall(EYE, 0.0), "rate needs"),
+        (lambda: ErrorBall(EYE, np.nan), "does not contract"),
+        (lambda: ErrorBall(-EYE, 1.0), "positive definite"),
+        (lambda: ErrorBall(np.ones((2, 3)), 1.0), "metric needs shape"),
+        (lambda: ErrorBall([[1.0, 0.5], [0.0, 1.0]], 1.0), "symmetric"),
+        (lambda: ErrorBall(EYE, 1.0, np.ones((3, 1))), "channel"),
+        (lambda: ErrorBall(EYE, 1.0, None, -1.0), "period"),
+        (lambda: ErrorBall(EYE, 1.0).radius(-1.0), "size needs"),
+        (lambda: ErrorBall(EYE, 1.0).bound(-1.0, 0.0, 1.0), "time needs"),
+        (lambda: ErrorBall.of(circle_criterion(0.1, 0.8, 2.4)), "without a certificate"),
+        (lambda: ErrorBall.of(replace(FOUND, kind="frozen")), "frozen"),
+        (lambda: ErrorBall.of(FOUND, period=0.01), "does not go with"),
+        (lambda: signal_length(EYE, "abc"), "row needs real numbers"),
+        (lambda: peak_gain(-EYE, np.eye(3), [1.0, 0.0]), "channel needs shape"),
+        (lambda: peak_gain(0 * EYE, EYE, [1.0, 0.0]), "not stable"),
+        (lambda: peak_gain([[-1e-9, 9.0], [-9.0, -1e-9]], EYE, [1.0, 0.0]), "turns"),
+        (lambda: reach(-EYE, EYE, EYE, samples=10**30), "samples needs"),
+        (lambda: random_disturbances(np.random.default_rng(0), 0, 1, 1.0, step=0.1), "steps needs"),
+        (lambda: nominal_metric(EYE), "stable loops"),
+        (lambda: nominal_metric(-EYE, share=1.0), "share"),
+        (lambda: nominal_metric(np.full((2, 2), np.nan)), "jacobian needs finite"),
+    ],
+)
+def test_bad_arguments_are_named(call, message):
+    with pytest.raises((ValueError, TypeError), match=message):
+        call()

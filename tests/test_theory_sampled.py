@@ -96,13 +96,13 @@ def test_known_limits():
 
 
 def test_bad_input_is_refused():
-    with pytest.raises(ValueError, match="tau needs positive finite"):
+    with pytest.raises(ValueError, match="tau needs positive"):
         largest_slope(-0.01, 1.0, 0.01)
-    with pytest.raises(ValueError, match="h needs positive finite"):
+    with pytest.raises(ValueError, match="h needs positive"):
         sampled_margin(1.0, 1.0, 0.01, 1.0, 0.0)
     with pytest.raises(ValueError, match="ratio or k2, not both"):
         largest_slope(0.01, 1.0, 0.01, ratio=1.0, k2=1.0)
     with pytest.raises(ValueError, match="leaves no room"):
         largest_slope(0.01, 1.0, 0.01, k2=1e4)
-    with pytest.raises(ValueError, match="0 or more"):
+    with pytest.raises(ValueError, match="ratio needs values of at least 0"):
         largest_slope(0.01, 1.0, 0.01, ratio=-1.0)

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import Array, checked
+from cmc.theory.arrays import Array, checked, not_square, together
 from cmc.theory.auxiliary import AuxiliarySpace, decompose
-from cmc.theory.jacobians import complex_step, differences, jacobian_fault, not_square
+from cmc.theory.identification import complex_step, differences, jacobian_fault
 from cmc.theory.simulate import equilibrium
 
 Function = Callable[..., Any]
@@ -24,28 +24,21 @@ class Plant(ABC):
     """A system y' = f(y, u, t) with as many commands as latent signals.
 
     Arrays carry any leading batch axes: `y` and `u` are (..., n), Jacobians (..., n, n).
-
-    Attributes:
-        name: The name under which `cmc.plants.get` builds it.
-        n: Number of latent signals and of commands.
-        state_names: One name per latent signal.
-        units: One unit per latent signal.
-        y_low: Lower end of the region of interest, (n,).
-        y_high: Upper end of the region of interest, (n,).
-        u_low: Smallest admissible command, (n,).
-        u_high: Largest admissible command, (n,).
-        constant: Whether f_y and f_u are the same everywhere and f does not depend on time, so that
-            the transforms are the same as well.
     """
 
     name: str
+    """The name under which `cmc.plants.get` builds it."""
     n: int = 2
+    """Number of latent signals and of commands."""
     constant: bool = False
+    """Whether f_y and f_u are the same everywhere and f does not depend on time."""
     state_names: Sequence[str] = ("y1", "y2")
     units: Sequence[str] = ("1", "1")
     y_low: Array
+    """Lower end of the region of interest, (n,); `y_high` is the upper one."""
     y_high: Array
     u_low: Array
+    """Smallest admissible command, (n,); `u_high` is the largest."""
     u_high: Array
 
     @classmethod
@@ -67,6 +60,9 @@ class Plant(ABC):
                 lambda y, u: [u[0] - y[0], y[0] - y[1] ** 3 + u[1]], y=([-1, -1], [1, 1]), u=(-1, 1)
             )
 
+        Another number of commands than of signals, an f that is not finite in the box, and a given
+        Jacobian that does not belong to f are refused by a ValueError.
+
         Args:
             f: Maps y (n, N), u (n, N), and the time if it takes three arguments, to n rows: signals
                 come first, so `y1, y2 = y` and `A @ y` both work. A function of single vectors is
@@ -79,10 +75,6 @@ class Plant(ABC):
             name: For messages.
             state_names: One name per latent signal.
             units: One unit per latent signal.
-
-        Raises:
-            ValueError: If there are not as many commands as signals, shapes do not fit, f is not
-                finite in the box, or a given Jacobian does not belong to f.
         """
         return FunctionPlant(f, y, u, (f_y, f_u), name, state_names, units)
 
@@ -104,20 +96,18 @@ class Plant(ABC):
 
     def space(self, y: ArrayLike = 0.0, u: ArrayLike = 0.0) -> AuxiliarySpace:
         """`decompose` of f_y and f_u at a state and a command, numbers or (..., n)."""
-        at = [np.asarray(value, dtype=float) for value in (y, u)]
+        at = checked("y", y), checked("u", u)
         y, u = (np.broadcast_to(v, (self.n,)) if v.ndim == 0 else v for v in at)
         return decompose(self.f_y(y, u), self.f_u(y, u))
 
     def _pair(self, y: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
-        """Check the last axes and broadcast the batch axes of `y` and `u`."""
-        y, u = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
-        for symbol, value in (("y", y), ("u", u)):
-            if value.ndim == 0 or value.shape[-1] != self.n:
-                raise ValueError(
-                    f"{self.name}: {symbol} needs shape (..., {self.n}), got {value.shape}"
-                )
-        shape = np.broadcast_shapes(y.shape, u.shape)
-        return np.broadcast_to(y, shape), np.broadcast_to(u, shape)
+        """Check and broadcast `y` and `u`; where a simulation explodes they are not finite."""
+        pair = {
+            name: checked(f"{self.name}: {name}", value, "... n", n=self.n, finite=False)
+            for name, value in (("y", y), ("u", u))
+        }
+        y, u = together(**pair)
+        return y, u
 
     def _box(self, y: Sequence[float], u: Sequence[float]) -> None:
         """Set symmetric bounds |y| <= y, |u| <= u."""
@@ -126,6 +116,41 @@ class Plant(ABC):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(name={self.name!r}, n={self.n})"
+
+
+class LinearPlant(Plant):
+    """y' = A y + B u with constant matrices.
+
+    Args:
+        A: State matrix f_y, (n, n), 1/s.
+        B: Command matrix f_u, (n, n), 1/s.
+    """
+
+    name = "linear"
+    constant = True
+
+    def __init__(self, A: ArrayLike, B: ArrayLike) -> None:
+        self.A, B = checked("A", A, "n n").copy(), checked("B", B)
+        self.n = len(self.A)
+        if B.ndim == 2 and len(B) == self.n != B.shape[1]:
+            raise ValueError(not_square(self.n, B.shape[1]))
+        self.B = checked("B", B, "n n", n=self.n).copy()
+        self.state_names = tuple(f"y{i + 1}" for i in range(self.n))
+        self.units = ("1",) * self.n
+        self._box([3.0] * self.n, [10.0] * self.n)
+
+    def f(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> Array:
+        """A y + B u, (..., n)."""
+        y, u = self._pair(y, u)
+        return y @ self.A.T + u @ self.B.T
+
+    def f_y(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> Array:
+        """A, repeated over the batch, (..., n, n)."""
+        return np.tile(self.A, (*self._pair(y, u)[0].shape[:-1], 1, 1))
+
+    def f_u(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> Array:
+        """B, repeated over the batch, (..., n, n)."""
+        return np.tile(self.B, (*self._pair(y, u)[0].shape[:-1], 1, 1))
 
 
 class FunctionPlant(Plant):
@@ -141,14 +166,19 @@ class FunctionPlant(Plant):
         state_names: Sequence[str] | None,
         units: Sequence[str] | None,
     ) -> None:
-        self.y_low, self.y_high = checked("y[0]", y[0], "n"), checked("y[1]", y[1], "n")
+        if not all(isinstance(box, (list, tuple, np.ndarray)) and len(box) == 2 for box in (y, u)):
+            raise ValueError(f"y and u each need (low, high), got y = {y!r}, u = {u!r}")
+        if not all(callable(g) for g in (f, *jacobians) if g is not None):
+            raise TypeError("f, f_y and f_u need to be functions of y and u")
+        self.y_low = checked("y[0]", y[0], "n").copy()
         self.name, self.n = name, len(self.y_low)
-        commands = [np.asarray(end, dtype=float) for end in u]
-        m = max([end.shape[0] for end in commands if end.ndim == 1] or [self.n])
+        self.y_high = checked("y[1]", y[1], "n", n=self.n).copy()
+        m = max([np.size(end) for end in u if np.ndim(end) == 1] or [self.n])
         if m != self.n:
             raise ValueError(not_square(self.n, m))
         self.u_low, self.u_high = (
-            np.broadcast_to(checked(f"u[{k}]", end), (m,)).copy() for k, end in enumerate(commands)
+            np.zeros(m) + checked(f"u[{k}]", end, "m" if np.ndim(end) else "", m=m)
+            for k, end in enumerate(u)
         )
         if (self.y_low >= self.y_high).any() or (self.u_low >= self.u_high).any():
             raise ValueError("y and u each need (low, high) with low < high")
@@ -182,23 +212,28 @@ class FunctionPlant(Plant):
 
     def f_y(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> Array:
         """Its Jacobian in y, (..., n, n)."""
-        y, u = self._pair(y, u)
-        if self._own[0] is not None:
-            return self._given(self._own[0], y, u, t)
-        if self.how == "complex step":
-            return complex_step(lambda x: self._rows(x, u[..., None, :], t, complex), y)
-        width = self.y_high - self.y_low
-        return differences(lambda x: self.f(x, u[..., None, :], t), y, 1e-6 * width)
+        return self._jacobian(0, y, u, t)
 
     def f_u(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> Array:
         """Its Jacobian in u, (..., n, n)."""
-        y, u = self._pair(y, u)
-        if self._own[1] is not None:
-            return self._given(self._own[1], y, u, t)
+        return self._jacobian(1, y, u, t)
+
+    def _jacobian(self, which: int, y: ArrayLike, u: ArrayLike, t: float) -> Array:
+        """Given, by a complex step, or by differences; in y (0) or u (1)."""
+        pair = y, u = self._pair(y, u)
+        if (given := self._own[which]) is not None:
+            return self._given(given, y, u, t)
+        other = pair[1 - which][..., None, :]
+
+        def along(x: Any) -> Any:
+            kind = complex if self.how == "complex step" else float
+            a, b = (x, other) if which == 0 else (other, x)
+            return self._rows(a, b, t, kind)
+
         if self.how == "complex step":
-            return complex_step(lambda x: self._rows(y[..., None, :], x, t, complex), u)
-        width = self.u_high - self.u_low
-        return differences(lambda x: self.f(y[..., None, :], x, t), u, 1e-6 * width)
+            return complex_step(along, pair[which])
+        width = (self.y_high - self.y_low, self.u_high - self.u_low)[which]
+        return differences(along, pair[which], 1e-6 * width)
 
     def _rows(self, y: Any, u: Any, t: float, kind: type) -> Any:
         """Call f on signals-first arrays and bring its rows back, (..., n)."""
@@ -245,11 +280,9 @@ class FunctionPlant(Plant):
     def _is_affine(self) -> bool:
         """Whether f is affine and free of time, on points of the boxes and far beyond them."""
         rng, n, reach = np.random.default_rng(1), self.n, 10.0 ** np.arange(3).repeat(8)[:, None]
-        y = (self.y_high + self.y_low) / 2 + reach * (self.y_high - self.y_low) * rng.uniform(
-            -0.5, 0.5, (24, n)
-        )
-        u = (self.u_high + self.u_low) / 2 + reach * (self.u_high - self.u_low) * rng.uniform(
-            -0.5, 0.5, (24, n)
+        y, u = (
+            (high + low) / 2 + reach * (high - low) * rng.uniform(-0.5, 0.5, (24, n))
+            for low, high in ((self.y_low, self.y_high), (self.u_low, self.u_high))
         )
         A, B = self.f_y(y[0], u[0]), self.f_u(y[0], u[0])
         try:
@@ -268,33 +301,3 @@ def _takes_time(f: Function) -> bool:
     except TypeError:
         return False
     return True
-
-
-def finite_matrix(name: str, value: ArrayLike, n: int | None = None) -> Array:
-    """Return `value` as a finite square matrix, (n, n).
-
-    Raises:
-        ValueError: if it is not square, not of size `n`, or not finite.
-    """
-    matrix = np.array(value, dtype=float)
-    wanted = "square matrix" if n is None else f"{n} x {n} matrix"
-    square = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1]
-    if not square or n not in (None, matrix.shape[0]):
-        raise ValueError(f"{name} needs a {wanted}, got shape {matrix.shape}")
-    if not np.isfinite(matrix).all():
-        raise ValueError(f"{name} needs finite entries, got {matrix.tolist()}")
-    return matrix
-
-
-def parameter(name: str, value: ArrayLike, *, positive: bool = False) -> Array:
-    """Return a scalar or batched parameter as a finite array.
-
-    Raises:
-        ValueError: if it is not finite, or not positive where it must be.
-    """
-    array = np.array(value, dtype=float)
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} needs finite values, got {array}")
-    if positive and (array <= 0).any():
-        raise ValueError(f"{name} needs positive values, got a minimum of {array.min()}")
-    return array

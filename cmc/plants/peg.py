@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.plants.base import Array, Plant, parameter
+from cmc.plants.base import Plant
+from cmc.theory.arrays import Array, checked, not_overflown
 
 
 class Peg(Plant):
@@ -41,13 +42,14 @@ class Peg(Plant):
         surface_sin: ArrayLike = 0.01,
         surface_cos: ArrayLike = -0.01,
     ) -> None:
-        self.tau_x = parameter("tau_x", tau_x, positive=True)
-        self.tau_z = parameter("tau_z", tau_z, positive=True)
-        self.K_sur = parameter("K_sur", K_sur, positive=True)
-        self.surface_sin = parameter("surface_sin", surface_sin)
-        self.surface_cos = parameter("surface_cos", surface_cos)
+        self.tau_x = checked("tau_x", tau_x, above=0.0).copy()
+        self.tau_z = checked("tau_z", tau_z, above=0.0).copy()
+        self.K_sur = checked("K_sur", K_sur, above=0.0).copy()
+        self.surface_sin = checked("surface_sin", surface_sin).copy()
+        self.surface_cos = checked("surface_cos", surface_cos).copy()
         steepest = self.K_sur * (self.z_range[0] - np.hypot(self.surface_sin, self.surface_cos))
-        self.y_low = np.array([self.x_range[0], float(np.min(steepest))])
+        not_overflown("K_sur and the surface", steepest)
+        self.y_low = np.array([self.x_range[0], float(np.min(steepest, initial=0.0))])
         self.y_high = np.array([self.x_range[1], 0.0])
         self.u_low = np.array([self.x_range[0], self.z_range[0]])
         self.u_high = np.array([self.x_range[1], self.z_range[1]])
@@ -71,14 +73,7 @@ class Peg(Plant):
     def step(self, x: ArrayLike, z: ArrayLike, u: ArrayLike, h: float) -> tuple[Array, Array]:
         """Positions after `h` seconds under a held command: exact, since both lags are linear.
 
-        Args:
-            x: Position along the surface, (...).
-            z: Height, (...).
-            u: Command (u_x, u_z), (..., 2).
-            h: Sample time, s.
-
-        Returns:
-            The new x and z, each (...).
+        x and z are (...), u = (u_x, u_z) is (..., 2); returns the new x and z, each (...).
         """
         if not h > 0:
             raise ValueError(f"h needs a positive sample time in seconds, got {h}")

@@ -1,4 +1,4 @@
-"""The one door for arrays: what is wrong with an argument, said with its name; and compiling."""
+"""The one door for arguments: what is wrong with one, said with its name; and compiling."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ def checked(
     *,
     least: float | None = None,
     above: float | None = None,
+    finite: bool = True,
     **sizes: int,
 ) -> Array:
     """Return `value` as finite float64 of a wanted shape.
@@ -29,6 +30,7 @@ def checked(
         shape: Axes by name or size, such as "... n n" or "time 2"; "..." is any batch, "" a number.
         least: Smallest value allowed.
         above: Every value is larger than this.
+        finite: Whether NaN and infinity are refused.
         **sizes: Sizes of named axes; a name without a size takes the first that comes, at least 1.
 
     Raises:
@@ -37,8 +39,8 @@ def checked(
     """
     try:
         array = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        raise TypeError(f"{name} needs an array of real numbers, got {value!r}") from None
+    except (TypeError, ValueError, RuntimeError):  # rows of different lengths, a strange object
+        raise TypeError(f"{name} needs an array of real numbers, got {_short(value)}") from None
     if array.dtype.kind not in "biuf":
         raise TypeError(f"{name} needs real numbers, got {_short(value)} (dtype {array.dtype})")
     array = array.astype(np.float64, copy=False)
@@ -55,6 +57,8 @@ def checked(
         comma = "," if len(axes) == 1 and not batch else ""
         wish = f"shape ({words}{comma})" if axes else "a single number"
         raise ValueError(f"{name} needs {wish}, got shape {found}")
+    if not finite:
+        return array
     bad, wish = ~np.isfinite(array), "finite values"
     if least is not None and not bad.any():
         bad, wish = array < least, f"values of at least {least:g}"
@@ -75,23 +79,67 @@ def number(
     return float(checked(name, value, "", least=least, above=above))
 
 
-def count(name: str, value: int, most: int = 1_000_000) -> int:
-    """Return `value` as a whole number from 1 to `most`.
-
-    Raises:
-        ValueError: If it is another one.
-    """
-    if isinstance(value, bool) or value != value or int(value) != value or not 1 <= value <= most:
-        raise ValueError(f"{name} needs a whole number from 1 to {most}, got {value!r}")
+def count(name: str, value: float, most: int = 1_000_000) -> int:
+    """Return `value` as a whole number from 1 to `most`, or raise a ValueError."""
+    whole = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    if not whole or not 1 <= value <= most or int(value) != value:
+        raise ValueError(f"{name} needs a whole number from 1 to {most}, got {_short(value)}")
     return int(value)
+
+
+def refuse_uncallable(name: str, value: Any) -> None:
+    """Raise a TypeError where `value` cannot be called."""
+    if not callable(value):
+        raise TypeError(f"{name} needs a function, got {_short(value)}")
+
+
+def increasing(name: str, value: ArrayLike, least: int = 2) -> Array:
+    """Return `value` as at least `least` increasing numbers, (time,)."""
+    times = checked(name, value, "time")
+    if len(times) < least or not (np.diff(times) > 0).all():
+        raise ValueError(f"{name} needs at least {least} increasing values, got {_short(value)}")
+    return times
+
+
+def together(**arrays: NDArray[Any]) -> list[NDArray[Any]]:
+    """Broadcast arrays to one shape, or raise a ValueError that names them."""
+    try:
+        return list(np.broadcast_arrays(*arrays.values()))
+    except ValueError:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise ValueError(f"these need to fit together (broadcast), got {shapes}") from None
+
+
+def inverse(name: str, matrix: NDArray[Any]) -> NDArray[Any]:
+    """Return the inverse of (..., n, n), or raise a ValueError that names it."""
+    try:
+        return np.linalg.inv(matrix)
+    except np.linalg.LinAlgError:
+        raise ValueError(f"{name} needs to be invertible, got a singular matrix") from None
+
+
+def not_overflown(names: str, *arrays: NDArray[Any]) -> None:
+    """Raise a ValueError where arithmetic left the range of floats."""
+    if not all(np.isfinite(array).all() for array in arrays):
+        raise ValueError(f"{names}: too large or too small to compute with; choose other units")
+
+
+def not_square(n: int, m: int) -> str:
+    """The sentence for a plant with n signals and m commands."""
+    signals, commands = f"{n} signal{'s' * (n != 1)}", f"{m} command{'s' * (m != 1)}"
+    return (
+        f"the plant has {signals} and {commands}; the theory wants as many signals as commands. "
+        "Command a composite signal instead, a combination of signals with one entry for each "
+        "command (cmc.theory.composite, lesson 06), or a learned one (cmc.policies.latent_signal)"
+    )
 
 
 def compiled(function: Callable[..., Any]) -> Any:
     """Compile on the first call; keep it on disk where there is a place to keep it."""
     try:
-        return numba.njit(cache=True, error_model="numpy")(function)
+        return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     except RuntimeError:  # a read-only installation without a home
-        return numba.njit(error_model="numpy")(function)
+        return numba.njit(nogil=True, error_model="numpy")(function)
 
 
 def _short(value: object) -> str:

@@ -12,26 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import checked
-from cmc.theory.explicit import spaces_of, triangular_of
-from cmc.theory.spectrum import (
-    Array,
-    ComplexEigenvalueError,
-    DefectiveMatrixError,
-    SingularInputError,
-    checked_pair,
-    checked_square,
-    real_eigenbasis,
-)
-
-__all__ = [
-    "AuxiliarySpace",
-    "ComplexEigenvalueError",
-    "DefectiveMatrixError",
-    "SingularInputError",
-    "decompose",
-    "triangularize",
-]
+from cmc.theory.arrays import Array, checked, inverse, not_overflown, together
+from cmc.theory.explicit import checked_pair, real_eigenbasis, spaces_of, triangular_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +21,7 @@ class AuxiliarySpace:
     """Transforms and the Jacobians they produce, each of shape (..., n, n).
 
     `Lambda = T_y f_y T_y^-1` in 1/s and `R = T_y f_u T_a` (eq_theorem2); leading axes are a batch
-    or time.
-
-    Raises:
-        TypeError: If the entries are not real numbers.
-        ValueError: If shapes differ, are not square, or an entry is not finite.
+    or time. Wrong shapes and entries that are not finite raise ValueError, or TypeError.
     """
 
     T_y: Array
@@ -57,10 +35,10 @@ class AuxiliarySpace:
 
     def __post_init__(self) -> None:
         for name in ("T_y", "T_a", "Lambda", "R"):
-            object.__setattr__(self, name, checked_square(getattr(self, name), name))
+            object.__setattr__(self, name, checked(name, getattr(self, name), "... n n"))
             if getattr(self, name).shape != self.T_y.shape:
-                shapes = [getattr(self, k).shape for k in ("T_y", "T_a", "Lambda", "R")]
-                raise ValueError(f"T_y, T_a, Lambda, R must have one shape, got {shapes}")
+                shapes = [np.shape(getattr(self, k)) for k in ("T_y", "T_a", "Lambda", "R")]
+                raise ValueError(f"T_y, T_a, Lambda, R need one shape, got {shapes}")
 
     @classmethod
     def from_transforms(
@@ -68,29 +46,19 @@ class AuxiliarySpace:
     ) -> AuxiliarySpace:
         """Apply given transforms: `Lambda = T_y f_y T_y^-1`, `R = T_y f_u T_a`, of any structure.
 
-        Args:
-            T_y: Transform of the latent signal, (..., n, n), invertible.
-            T_a: Transform of the action, (..., n, n).
-            f_y: Jacobian of the plant in `y` [1/s], (..., n, n).
-            f_u: Jacobian of the plant in `u`, (..., n, n).
-
-        Raises:
-            TypeError: If the entries are not real numbers.
-            ValueError: If shapes do not fit or an entry is not finite.
-            numpy.linalg.LinAlgError: If `T_y` is singular.
+        All are (..., n, n) and broadcast; f_y in 1/s.
         """
-        given = [(T_y, "T_y"), (T_a, "T_a"), (f_y, "f_y"), (f_u, "f_u")]
-        try:
-            y, a, J, G = np.broadcast_arrays(*(checked_square(x, name) for x, name in given))
-        except ValueError as error:
-            shapes = ", ".join(f"{name} {np.shape(x)}" for x, name in given)
-            raise ValueError(f"T_y, T_a, f_y, f_u must fit together: {shapes}; {error}") from None
-        return cls(y, a, y @ J @ np.linalg.inv(y), y @ G @ a)
+        given = {"T_y": T_y, "T_a": T_a, "f_y": f_y, "f_u": f_u}
+        n = checked("T_y", T_y, "... n n").shape[-1]
+        y, a, J, G = together(**{k: checked(k, x, "... n n", n=n) for k, x in given.items()})
+        Lambda, R = y @ J @ inverse("T_y", y), y @ G @ a
+        not_overflown("T_y, T_a, f_y and f_u", Lambda, R)
+        return cls(y, a, Lambda, R)
 
     @classmethod
     def identity(cls, f_y: ArrayLike, f_u: ArrayLike) -> AuxiliarySpace:
         """Leave the coordinates alone: `T_y = T_a = I`, `Lambda = f_y`, `R = f_u`."""
-        eye = np.eye(np.shape(f_y)[-1]) if np.ndim(f_y) else f_y
+        eye = np.eye(checked("f_y", f_y, "... n n").shape[-1])
         return cls.from_transforms(eye, eye, f_y, f_u)
 
     @property
@@ -111,20 +79,20 @@ class AuxiliarySpace:
     @property
     def V(self) -> Array:
         """Eigenvector matrix `T_y^-1`, shape (..., n, n)."""
-        return inverse(self.T_y)
+        return inverse("T_y", self.T_y)
 
     def to_z(self, y: ArrayLike) -> Array:
         """Return `z = T_y y` for `y` of shape (..., n)."""
-        return np.einsum("...ij,...j->...i", self.T_y, np.asarray(y, dtype=np.float64))
+        return applied(self.T_y, checked("y", y, "... n", n=self.n))
 
     def to_u(self, a: ArrayLike) -> Array:
         """Return `u = T_a a` for `a` of shape (..., n)."""
-        return np.einsum("...ij,...j->...i", self.T_a, np.asarray(a, dtype=np.float64))
+        return applied(self.T_a, checked("a", a, "... n", n=self.n))
 
     def signed(self, k1: ArrayLike, k2: ArrayLike) -> Array:
         """Slopes of sizes `k1` in z and `k2` in int z against the sign of R_ii, (..., n, 2)."""
-        sizes = np.stack(np.broadcast_arrays(k1, k2, self.gains)[:2], axis=-1)
-        return -np.sign(self.gains)[..., None] * sizes  # constraint_sign
+        sizes = together(k1=checked("k1", k1), k2=checked("k2", k2), R_ii=self.gains)[:2]
+        return -np.sign(self.gains)[..., None] * np.stack(sizes, axis=-1)  # constraint_sign
 
     def loop(self, slopes: ArrayLike) -> Array:
         """Jacobian of the loop in (z, int z) [1/s] for signed slopes (..., n, 2): (..., 2n, 2n).
@@ -133,10 +101,16 @@ class AuxiliarySpace:
         """
         s, n = checked("slopes", slopes, "... n 2", n=self.n), self.n
         P, Q = s[..., None, :, 0], s[..., None, :, 1]
-        top = np.concatenate(np.broadcast_arrays(self.Lambda + self.R * P, self.R * Q), axis=-1)
+        top = np.concatenate(together(slopes=self.Lambda + self.R * P, R=self.R * Q), axis=-1)
         J = np.zeros((*top.shape[:-2], 2 * n, 2 * n))
         J[..., :n, :], J[..., n:, :n] = top, np.eye(n)
+        not_overflown("slopes", J)
         return J
+
+
+def applied(matrix: Array, x: Array) -> Array:
+    """M x for (..., n, n) and (..., n)."""
+    return np.einsum("...ij,...j->...i", matrix, x)
 
 
 def decompose(f_y: ArrayLike, f_u: ArrayLike) -> AuxiliarySpace:
@@ -151,24 +125,20 @@ def decompose(f_y: ArrayLike, f_u: ArrayLike) -> AuxiliarySpace:
         f_y: Jacobian of the plant in `y` [1/s], (..., n, n), with real eigenvalues.
         f_u: Jacobian of the plant in `u`, (..., n, n), invertible; batches broadcast.
 
-    Returns:
-        The auxiliary space; its arrays have the broadcast shape (..., n, n).
-
     Raises:
         ComplexEigenvalueError: If `f_y` has a complex pair (use the feedback combination).
         DefectiveMatrixError: If `f_y` lacks eigenvectors, to working precision.
         SingularInputError: If `f_u` is singular.
-        TypeError: If the entries are not real numbers.
-        ValueError: If shapes do not fit or an entry is NaN or infinite.
+        ValueError: If shapes do not fit or an entry is NaN or infinite; TypeError if not real.
 
     Source: appendix "Proof of the theorem for the hierarchical combination" (the theorem's own text
     prints `T_y = V` and forgets a transpose; lesson 04 shows that both are needed).
     """
     space = _at_once(f_y, f_u)
-    if space is not None:
-        return space
-    f_y, f_u = checked_pair(f_y, f_u)
-    return assemble(*real_eigenbasis(f_y), f_u)
+    if space is None:
+        f_y, f_u = checked_pair(f_y, f_u)
+        space = assemble(*real_eigenbasis(f_y), f_u)
+    return space
 
 
 def _at_once(f_y: Any, f_u: Any) -> AuxiliarySpace | None:
@@ -179,9 +149,8 @@ def _at_once(f_y: Any, f_u: Any) -> AuxiliarySpace | None:
         or shape != getattr(f_u, "shape", ())
         or shape[-1] != shape[-2]
         or not f_y.size
+        or not f_y.dtype == f_u.dtype == np.float64
     ):
-        return None
-    if not f_y.dtype == f_u.dtype == np.float64:
         return None
     flat = [np.ascontiguousarray(x).reshape(-1, *shape[-2:]) for x in (f_y, f_u)]
     arrays = np.empty((4, *flat[0].shape))
@@ -195,7 +164,7 @@ def _at_once(f_y: Any, f_u: Any) -> AuxiliarySpace | None:
 
 def assemble(eigenvalues: Array, V: Array, f_u: Array) -> AuxiliarySpace:
     """Build the space from an eigenbasis: eigenvalues (..., n), `V` and `f_u` (..., n, n)."""
-    T_y = inverse(V)
+    T_y = np.linalg.inv(V)
     T_a, R = triangularize(T_y @ f_u)
     return _trusted(T_y, T_a, eigenvalues[..., None] * np.eye(V.shape[-1]), R)
 
@@ -203,27 +172,18 @@ def assemble(eigenvalues: Array, V: Array, f_u: Array) -> AuxiliarySpace:
 def triangularize(W: Array) -> tuple[Array, Array]:
     """Return an orthogonal `T_a` and `R = W T_a`, upper triangular with a positive diagonal.
 
-    `W^T P = Q R_qr` with P the exchange matrix gives `T_a = Q P` and `R = P R_qr^T P`.
-
-    Args:
-        W: `T_y f_u`, (..., n, n), invertible.
-
-    Returns:
-        `T_a` and `R`, each (..., n, n).
+    `W^T P = Q R_qr` with P the exchange matrix gives `T_a = Q P` and `R = P R_qr^T P`, for an
+    invertible `W = T_y f_u`, (..., n, n).
     """
     flat = np.ascontiguousarray(W, dtype=np.float64).reshape(-1, *W.shape[-2:])
     T_a, R = np.empty(flat.shape), np.empty(flat.shape)
     for k in range(len(flat)):
         triangular_of(flat[k], T_a[k], R[k])
+    not_overflown("f_y and f_u", T_a, R)
     return T_a.reshape(W.shape), R.reshape(W.shape)
 
 
-def inverse(V: Array) -> Array:
-    """Return `V^-1` for (..., n, n)."""
-    return np.asarray(np.linalg.inv(V), dtype=np.float64)
-
-
-def _trusted(T_y: Array, T_a: Array, Lambda: Array, R: Array) -> AuxiliarySpace:
+def _trusted(T_y: Any, T_a: Any, Lambda: Any, R: Any) -> AuxiliarySpace:
     """Make a space from arrays that are right by construction, without checking them again."""
     space = object.__new__(AuxiliarySpace)
     space.__dict__.update(T_y=T_y, T_a=T_a, Lambda=Lambda, R=R)

@@ -17,7 +17,7 @@ from cmc.theory.arrays import Array
 from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.certificates import Certificate
 from cmc.theory.contraction import metric_factor
-from cmc.theory.jacobians import differences
+from cmc.theory.identification import differences
 from cmc.theory.simulate import Loop
 
 _SAMPLES = 2048
@@ -26,9 +26,7 @@ _SAMPLES = 2048
 def rest_point(loop: Loop, keep: Array) -> Array | None:
     """State (y, int z), (2n,), in which the loop rests; None where Newton's method finds none.
 
-    Args:
-        loop: Plant and policy.
-        keep: Which states the loop has, indices below 2n: an integral that nothing uses is free.
+    `keep` says which states the loop has: an integral that nothing uses is free.
     """
     n = loop.n
     start = np.concatenate([loop.y_ref + np.zeros(n), np.zeros(n)])
@@ -39,22 +37,23 @@ def rest_point(loop: Loop, keep: Array) -> Array | None:
         return loop.field(0.0, s)[..., keep]
 
     x = start[keep]
-    r = residual(x)
-    first = scale = float(np.linalg.norm(r))
-    for _ in range(60):
-        if not np.isfinite(r).all():
-            return None
-        size = 1e-6 * (np.abs(x) + 1e-3 * np.abs(x).max() + 1e-6)
-        move = -np.linalg.lstsq(differences(residual, x, size), r, rcond=None)[0]
-        length = 1.0
-        while not np.linalg.norm(residual(x + length * move)) < scale and length > 1e-6:
-            length /= 2
-        if length <= 1e-6:
-            break
-        x = x + length * move
+    try:
         r = residual(x)
-        scale = float(np.linalg.norm(r))
-    if scale > 1e-9 * first + 1e-12:
+        first = scale = float(np.linalg.norm(r))
+        for _ in range(60):
+            size = 1e-6 * (np.abs(x) + 1e-3 * np.abs(x).max() + 1e-6)
+            move = -np.linalg.lstsq(differences(residual, x, size), r, rcond=None)[0]
+            length = 1.0
+            while not np.linalg.norm(residual(x + length * move)) < scale and length > 1e-6:
+                length /= 2
+            if length <= 1e-6:
+                break
+            x = x + length * move
+            r = residual(x)
+            scale = float(np.linalg.norm(r))
+    except (ValueError, TypeError, np.linalg.LinAlgError):
+        return None
+    if not scale <= 1e-9 * first + 1e-12:
         return None
     start[keep] = x
     return start
@@ -78,24 +77,22 @@ def ball_everywhere(
     low, high = _limits(plant)
     if not (np.isfinite(low).any() or np.isfinite(high).any()):
         return replace(answer, ball=np.inf)
+    caution = "while no command is clipped at the plant's limits"
     try:
         loop = Loop(plant, policy, space, y_ref)
-        rest = rest_point(loop, keep)
-    except (ValueError, TypeError, np.linalg.LinAlgError):
-        rest = None
-    caution = "while no command is clipped at the plant's limits"
+    except (ValueError, TypeError):  # slopes alone say nothing about commands
+        return replace(answer, reason=f"{answer.reason}; {caution}")
+    rest = rest_point(loop, keep)
     if rest is None:
         return replace(answer, reason=f"{answer.reason}; {caution}")
-    n, m = space.n, len(keep)
-    rows = np.zeros(2 * n)
-    rows[keep] = np.linalg.norm(np.linalg.inv(metric_factor(answer.metric)), axis=1)  # type: ignore[arg-type]
+    n, rows = space.n, np.zeros(2 * space.n)
+    rows[keep] = np.linalg.norm(_spread_of(answer), axis=1)
     size = np.abs(np.stack(slopes)).max(axis=0)
     p = size[:, 0] + (0.0 if h is None else h * size[:, 1])
     speed = np.abs(space.T_a) @ (p * rows[:n] + size[:, 1] * rows[n:])
     u = loop.signals(rest[:n], rest[n:])[1]
     radius = float((np.minimum(u - low, high - u) / speed).min())
     state = np.concatenate([space.to_z(rest[:n] - loop.y_ref), rest[n:]])[keep]
-    assert m == len(answer.metric)  # type: ignore[arg-type]
     return _noted(replace(answer, rest=state), radius, caution)
 
 
@@ -103,15 +100,10 @@ def ball_in_box(
     answer: Certificate, loop: Loop, keep: Array, low: Array, high: Array, h: float | None
 ) -> Certificate:
     """Add the ball to a certificate in (y, int z) over a box; commands are looked at on points."""
-    caution = "nothing says that they do"
-    try:
-        rest = rest_point(loop, keep)
-    except (ValueError, np.linalg.LinAlgError):
-        rest = None
+    caution, rest = "nothing says that they do", rest_point(loop, keep)
     if rest is None:
         return replace(answer, reason=f"{answer.reason} ({caution}: no point of rest was found)")
-    n, m = loop.n, len(keep)
-    spread = np.linalg.inv(metric_factor(answer.metric))  # type: ignore[arg-type]
+    n, m, spread = loop.n, len(keep), _spread_of(answer)
     room = np.minimum(rest - low, high - rest)[keep] / np.linalg.norm(spread, axis=1)
     radius, limits, rng = float(room.min()), _limits(loop.plant), np.random.default_rng(3)
     if radius > 0:
@@ -129,6 +121,12 @@ def ball_in_box(
         else:
             radius = 0.0
     return _noted(replace(answer, rest=rest[keep]), 0.9 * radius, caution)
+
+
+def _spread_of(answer: Certificate) -> Array:
+    """Theta^-1 of the metric, (m, m)."""
+    assert answer.metric is not None
+    return np.asarray(np.linalg.inv(metric_factor(answer.metric)), dtype=float)
 
 
 def _noted(answer: Certificate, radius: float, caution: str) -> Certificate:

@@ -4,39 +4,27 @@ In the coordinates (z, int z) the loop z' = Lambda z + R a, a = pi(z, int z) has
 
     J = [[Lambda + R P, R Q], [I, 0]],    P = dpi/ds1, Q = dpi/ds2 (diagonal),
 
-without any derivative of P or Q: nothing is ignored. It is affine in the slopes, so one metric that
-works at the corners of their intervals works for every slope in between, constant or not. That is
-what the inequalities of theorem 2 (`eq_theorem2`) lack: they look at one frozen time after another.
+without any derivative of P or Q: nothing is ignored (`AuxiliarySpace.loop`). It is affine in
+the slopes, so one metric that works at the corners of their intervals works for every slope in
+between, constant or not. That is what the inequalities of theorem 2 (`eq_theorem2`) lack: they look
+at one frozen time after another.
 
 Rounding is part of the account: a rate is lowered by a bound on it before it is compared with 0.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from cmc.theory.arrays import Array, checked, number
 from cmc.theory.contraction import metric_factor, overshoot
-from cmc.theory.differential import loop_jacobian
-from cmc.theory.metric_search import MetricSearch, condition_metric, search_metric
+from cmc.theory.metric_search import condition_metric, search_metric
 
-__all__ = [
-    "Certificate",
-    "best_conditioned",
-    "circle_criterion",
-    "common_metric",
-    "loop_jacobian",
-    "rate_in",
-    "rates_in",
-]
-
-Kind = Literal["frozen", "exact"]
-Domain = Literal["continuous", "sampled"]
-Evidence = Literal["proof", "points"]
+Progress = Callable[[str], object]
 
 # Settling for this share of the largest provable rate keeps the metric well conditioned.
 _SHARE = 0.9
@@ -65,7 +53,7 @@ class Certificate:
             the policy does not use int z, and with y in place of z where a box was looked at.
         violated: The Jacobian (or step) that stands in the way, (m, m), or None.
         region: Where it holds, in words.
-        reason: Why it holds, or does not, in words.
+        reason: Why it holds, or does not and what would help, in words.
         refused: Whether the question could not be asked at all.
         evidence: "proof" if the argument covers the whole region, "points" if the Jacobians were
             looked at on points of it and nothing is said about those between.
@@ -76,15 +64,15 @@ class Certificate:
     """
 
     holds: bool
-    kind: Kind = "exact"
-    domain: Domain = "continuous"
+    kind: str = "exact"
+    domain: str = "continuous"
     rate: float = float("nan")
     metric: Array | None = None
     violated: Array | None = None
     region: str = "everywhere"
     reason: str = ""
     refused: bool = False
-    evidence: Evidence = "proof"
+    evidence: str = "proof"
     ball: float = float("nan")
     rest: Array | None = None
 
@@ -105,7 +93,7 @@ class Certificate:
         return f"{line}. {self.reason}" if self.reason else line
 
 
-def circle_criterion(c: float, k1: float, k2: float, *, region: str = "everywhere") -> Certificate:
+def circle_criterion(c: float, k1: float, k2: float) -> Certificate:
     """Decide w'' + c w' + k(t) w = 0 with c constant and k anywhere in [k1, k2], w = int z.
 
     A common quadratic metric exists if and only if 0 < k1 and sqrt(k2) - sqrt(k1) < c. It can be
@@ -116,82 +104,69 @@ def circle_criterion(c: float, k1: float, k2: float, *, region: str = "everywher
         c: Damping -(Lambda + R p), 1/s.
         k1: Smallest stiffness -R q, 1/s^2.
         k2: Largest stiffness, 1/s^2.
-        region: Where c and k hold, in words.
-
-    Raises:
-        ValueError: if k1 > k2 or a value is not finite.
     """
     c, k1, k2 = number("c", c), number("k1", k1), number("k2", k2)
-    if k1 > k2:
-        raise ValueError(f"finite c and k1 <= k2 are needed, got c {c}, k1 {k1}, k2 {k2}")
+    if k1 > k2 or max(abs(c), abs(k1), abs(k2)) > 1e150:
+        raise ValueError(f"c below 1e150 and k1 <= k2 are needed, got c {c}, k1 {k1}, k2 {k2}")
     corners = np.array([[[-c, -k], [1.0, 0.0]] for k in (k1, k2)])
-    first = k1 <= 0 or c <= 0
-    if _circle(c, k1, k2):
+
+    def shifted(beta: float) -> tuple[float, float, float]:
+        offset = beta**2 - beta * c
+        return c - 2 * beta, k1 + offset, k2 + offset
+
+    def meets(c: float, soft: float, stiff: float) -> bool:
+        return bool(c > 0 and soft > 0 and np.sqrt(stiff) - np.sqrt(soft) < c)
+
+    if meets(c, k1, k2):
         low, high = 0.0, c / 2
         for _ in range(60):
             beta = (low + high) / 2
-            low, high = (beta, high) if _circle(*_shifted(c, k1, k2, beta)) else (low, beta)
+            low, high = (beta, high) if meets(*shifted(beta)) else (low, beta)
         beta = _SHARE * low
-        damping, soft, stiff = _shifted(c, k1, k2, beta)
+        damping, soft, stiff = shifted(beta)
         mixed = damping**2 / 2 + np.sqrt(soft * stiff)
         # (w' + beta w, w) are the coordinates of e^{beta t} w
         shear = np.array([[1.0, beta], [0.0, 1.0]])
         metric = shear.T @ np.array([[1, damping / 2], [damping / 2, mixed]]) @ shear
         rate = rate_in(corners, metric)
         if rate > 0:
-            return Certificate(
-                True, rate=rate, metric=metric, region=region, reason="circle criterion"
-            )
-    if first:
+            return Certificate(True, rate=rate, metric=metric, reason="circle criterion")
+    if k1 <= 0 or c <= 0:
         reason = f"damping {c:.4g} and stiffness from {k1:.4g} on need to be positive"
-    else:
-        gap, most = np.sqrt(k2) - np.sqrt(k1), (c + np.sqrt(k1)) ** 2
-        reason = (
-            f"sqrt(k2) - sqrt(k1) = {gap:.4g} is not below c = {c:.4g}: the stiffness may reach "
-            f"{most:.4g}, and reaches {k2:.4g}"
-        )
-    return Certificate(False, violated=corners[0 if first else 1], region=region, reason=reason)
-
-
-def _circle(c: float, k1: float, k2: float) -> bool:
-    return bool(c > 0 and k1 > 0 and np.sqrt(k2) - np.sqrt(k1) < c)
-
-
-def _shifted(c: float, k1: float, k2: float, beta: float) -> tuple[float, float, float]:
-    offset = beta**2 - beta * c
-    return c - 2 * beta, k1 + offset, k2 + offset
+        return Certificate(False, violated=corners[0], reason=reason)
+    gap, most = np.sqrt(k2) - np.sqrt(k1), (c + np.sqrt(k1)) ** 2
+    reason = (
+        f"sqrt(k2) - sqrt(k1) = {gap:.4g} is not below c = {c:.4g}: the stiffness may reach "
+        f"{most:.4g}, and reaches {k2:.4g}"
+    )
+    return Certificate(False, violated=corners[1], reason=reason)
 
 
 def common_metric(
     vertices: ArrayLike,
     *,
     h: float | None = None,
-    region: str = "the hull of the vertices",
     slack: ArrayLike | None = None,
+    progress: Progress | None = None,
 ) -> Certificate:
     """Look for one metric in which every vertex, and so every matrix in their hull, contracts.
-
-    A few vertices are searched at once, and those that the metric fails join them.
 
     Args:
         vertices: Jacobians, (V, m, m), 1/s; with `h` the steps of a sampled loop.
         h: Sample time, s, where the vertices are steps.
-        region: Where the vertices bound the loop, in words.
         slack: How far off each entry of a vertex may be, (m, m).
-
-    Raises:
-        ValueError: if the vertices have a wrong shape or are not finite.
+        progress: Called with a line of text in each round, such as `print`.
     """
-    vertices = np.asarray(vertices)
-    if vertices.ndim != 3 or not len(vertices):
-        raise ValueError(f"vertices needs shape (V, m, m) with V >= 1, got {vertices.shape}")
     vertices = checked("vertices", vertices, "V m m")
     h = None if h is None else number("h", h, above=0.0)
-    domain: Domain = "continuous" if h is None else "sampled"
+    domain, hull = "continuous" if h is None else "sampled", "the hull of the vertices"
     count = len(vertices)
     active = np.unique(np.linspace(0, count - 1, min(_AT_ONCE, count)).astype(int))
     best: tuple[float, Array] | None = None
-    for _ in range(_ROUNDS):
+    for turn in range(_ROUNDS):
+        if progress is not None:
+            so_far = f", rate {best[0]:.3g} 1/s so far" if best else ""
+            progress(f"round {turn + 1}: one metric for {len(active)} of {count} vertices{so_far}")
         metric, aim, worst = _of_few(vertices[active], h)
         if metric is None:
             break
@@ -203,39 +178,45 @@ def common_metric(
             break
         active = np.union1d(active, np.argsort(rates)[:_MORE])
     if best is not None:
-        return Certificate(
-            True,
-            domain=domain,
-            rate=best[0],
-            metric=best[1],
-            region=region,
-            reason=f"one metric for {count} vertices",
-        )
+        reason = f"one metric for {count} vertices"
+        rate, metric = best
+        return Certificate(True, "exact", domain, rate, metric, region=hull, reason=reason)
     resists = vertices[active[worst] if metric is None else int(np.argmin(rates))]
-    reason = _why_not(resists, domain)
-    return Certificate(False, domain=domain, violated=resists, region=region, reason=reason)
+    reason = _why_not(resists, h)
+    return Certificate(False, "exact", domain, violated=resists, region=hull, reason=reason)
 
 
 def _of_few(vertices: Array, h: float | None) -> tuple[Array | None, float, int]:
     """A well conditioned metric near the largest rate, that rate, and the vertex that resists."""
-    found = _search(vertices, 0.0, h)
-    if found.metric is None:
-        return None, float("nan"), found.worst
+
+    def faster(rate: float) -> Array:
+        """Vertices that decay where the given ones decay at `rate`."""
+        if h is None:
+            return vertices + rate * np.eye(vertices.shape[-1])
+        return np.asarray(vertices * np.exp(rate * h))
+
+    metric, worst = search_metric(vertices, discrete=h is not None)
+    if metric is None:
+        return None, float("nan"), worst
     eigenvalues = np.linalg.eigvals(vertices)
     high = float(-eigenvalues.real.max())
     if h is not None:
         high = float(-np.log(max(np.abs(eigenvalues).max(), 1e-3)) / h)
-    metric, low = found.metric, max(rate_in(vertices, found.metric, h), 0.0)
+    low = max(rate_in(vertices, metric, h), 0.0)
     for _ in range(8):
         if high < 1.03 * low:
             break
         middle = (low + high) / 2
-        ahead = _search(vertices, middle, h).metric
+        ahead, _ = search_metric(faster(middle), discrete=h is not None)
         if ahead is None:
             high = middle
         else:
             metric, low = ahead, max(middle, rate_in(vertices, ahead, h))
-    return best_conditioned(vertices, metric, _SHARE * low, h), _SHARE * low, found.worst
+    aim = _SHARE * low
+    try:
+        return condition_metric(faster(aim), metric, discrete=h is not None), aim, worst
+    except (np.linalg.LinAlgError, ValueError):  # too ill conditioned to be improved
+        return metric, aim, worst
 
 
 def rate_in(
@@ -245,19 +226,23 @@ def rate_in(
     slack: ArrayLike | None = None,
 ) -> float:
     """Smallest rate of the vertices in a metric, 1/s; with `h` of the steps of a sampled loop."""
-    return float(rates_in(np.asarray(vertices, dtype=float), metric, h, slack).min())
+    return float(rates_in(vertices, metric, h, slack).min())
 
 
 def rates_in(
-    vertices: Array, metric: ArrayLike, h: float | None = None, slack: ArrayLike | None = None
+    vertices: ArrayLike, metric: ArrayLike, h: float | None = None, slack: ArrayLike | None = None
 ) -> Array:
     """Rates of the vertices (V, m, m) in a metric, lowered by a bound on rounding, (V,), 1/s."""
     theta = metric_factor(metric)
+    vertices = checked("vertices", vertices, "V m m", m=len(theta))
+    h = None if h is None else number("h", h, above=0.0)
+    n = len(theta)
+    off = np.zeros((n, n)) if slack is None else checked("slack", slack, "n n", n=n, least=0.0)
     inverse = np.linalg.inv(theta)
     rates = np.empty(len(vertices))
     for start in range(0, len(vertices), _CHUNK):
         J = vertices[start : start + _CHUNK]
-        loose = 4e-16 * J.shape[-1] * np.abs(J) + (0.0 if slack is None else np.asarray(slack))
+        loose = 4e-16 * J.shape[-1] * np.abs(J) + off
         doubt = np.linalg.norm(np.abs(theta) @ loose @ np.abs(inverse), axis=(-2, -1))
         local = theta @ J @ inverse
         if h is None:
@@ -269,26 +254,10 @@ def rates_in(
     return rates
 
 
-def best_conditioned(vertices: Array, metric: Array, rate: float, h: float | None = None) -> Array:
-    """The metric of smallest condition number that proves `rate`, from one that does, (m, m)."""
-    try:
-        if h is not None:
-            return condition_metric(vertices * np.exp(rate * h), metric, discrete=True)
-        return condition_metric(vertices + rate * np.eye(vertices.shape[-1]), metric)
-    except (np.linalg.LinAlgError, ValueError):  # too ill conditioned to be improved
-        return metric
-
-
-def _search(vertices: Array, rate: float, h: float | None) -> MetricSearch:
-    if h is not None:
-        return search_metric(vertices * np.exp(rate * h), discrete=True)
-    return search_metric(vertices + rate * np.eye(vertices.shape[-1]))
-
-
-def _why_not(worst: Array, domain: Domain) -> str:
+def _why_not(worst: Array, h: float | None) -> str:
     eigenvalues = np.linalg.eigvals(worst)
-    if domain == "sampled" and np.abs(eigenvalues).max() >= 1:
+    if h is not None and np.abs(eigenvalues).max() >= 1:
         return f"a vertex is unstable: spectral radius {np.abs(eigenvalues).max():.4g}"
-    if domain == "continuous" and eigenvalues.real.max() >= 0:
+    if h is None and eigenvalues.real.max() >= 0:
         return f"a vertex is unstable: eigenvalue real part {eigenvalues.real.max():.4g} 1/s"
     return "every vertex decays by itself, but no quadratic metric fits them all"

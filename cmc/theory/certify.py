@@ -18,6 +18,7 @@ from where on they are never reached.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from itertools import product
 from typing import Any
@@ -25,17 +26,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.action import factor_of, inner, slope_interval
-from cmc.theory.arrays import Array, number
+from cmc.theory.arrays import Array, checked, number
 from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.ball import ball_everywhere
-from cmc.theory.certificates import Certificate, common_metric, rate_in
+from cmc.theory.certificates import Certificate, Progress, common_metric, rate_in
 from cmc.theory.combinations import transforms_that_fit
-from cmc.theory.exact import Region, certify_exact
-from cmc.theory.hierarchy import BlockLoop, compose_hierarchical
-from cmc.theory.jacobians import jacobian_fault, require_square
+from cmc.theory.exact import Region, certify_exact, spread
+from cmc.theory.identification import jacobian_fault
+from cmc.theory.metric_search import search_metric
 from cmc.theory.sampled import hold
 from cmc.theory.simulate import transforms_of
+from cmc.theory.slopes import BlockLoop, compose_hierarchical, factor_of, inner, slope_interval
 
 Transforms = Callable[[Array], AuxiliarySpace]
 # Corner matrices of the whole loop are listed up to this many modes, 4^8 = 65536 of them.
@@ -48,9 +49,10 @@ def certify(
     *,
     region: Region | None = None,
     h: float | None = None,
-    kind: str | None = None,
+    kind: str = "exact",
     transforms: AuxiliarySpace | Transforms | None = None,
     y_ref: ArrayLike = 0.0,
+    progress: Progress | None = None,
 ) -> Certificate:
     """Say what is guaranteed about a policy on a plant.
 
@@ -63,34 +65,44 @@ def certify(
         region: Box that is looked at where nothing is proved everywhere; the plant's own bounds by
             default where its Jacobians vary.
         h: Sample time of a zero-order hold, s; continuous control without it.
-        kind: "exact" (the default) or "frozen".
+        kind: "exact" or "frozen".
         transforms: T_y and T_a in place of `decompose`, fixed or as a function of y (..., n).
         y_ref: Where the latent signal is to go, (n,); its deviation is what the policy sees.
+        progress: Called with a line of text as a long question goes on, such as `print`.
 
     Returns:
         A certificate. Whatever stands in the way (complex or defective modes, slopes that can
-        vanish, a transform that jumps) is its `reason`; `refused` marks questions it cannot answer.
-
-    Raises:
-        TypeError: if the policy has no slopes and no region is given.
-        ValueError: if shapes do not fit or `kind` is unknown.
+        vanish, a transform that jumps) is its `reason`, with what would help: which slope to lower
+        or raise, and to what where that is known (as slopes act: behind the 1/|R_ii| of a policy
+        that normalises). `refused` marks questions it cannot answer; a policy without slopes and
+        without a region raises a TypeError.
     """
-    if kind not in (None, "exact", "frozen"):
-        raise ValueError(f"kind needs to be 'exact', 'frozen' or None, got {kind!r}")
-    require_square(plant)
+    if not (isinstance(kind, str) and kind in ("exact", "frozen")):
+        raise ValueError(f"kind needs to be 'exact' or 'frozen', got {kind!r}")
+    if not all(hasattr(plant, name) for name in ("n", "f", "f_y", "f_u", "constant")):
+        raise TypeError(f"plant needs n, f, f_y, f_u and constant, as Plant has; got {plant!r}")
+    if not (region is None or isinstance(region, Region)):
+        raise TypeError(f"region needs a Region or None, got {region!r}")
+    if not (transforms is None or callable(transforms) or hasattr(transforms, "T_y")):
+        raise TypeError(f"transforms needs an AuxiliarySpace or a function, got {transforms!r}")
+    if not (progress is None or callable(progress)):
+        raise TypeError(f"progress needs a function of a line of text, got {progress!r}")
+    y_ref = checked("y_ref", y_ref)
+    if y_ref.shape not in ((), (plant.n,)):
+        raise ValueError(f"y_ref needs one number or ({plant.n},), got shape {y_ref.shape}")
+    h = None if h is None else number("h", h, above=0.0)
+    domain = "continuous" if h is None else "sampled"
+
+    def refuse(reason: object) -> Certificate:
+        return Certificate(False, domain=domain, reason=str(reason), refused=True)
+
     try:
         policy = inner(policy)
     except ValueError as error:
-        return Certificate(False, reason=str(error), refused=True)
-    h = None if h is None else number("h", h, above=0.0)
+        return refuse(error)
     box = Region(plant.y_low, plant.y_high) if region is None else region
-    box.check(plant.n)
-
-    def refuse(reason: object) -> Certificate:
-        return Certificate(
-            False, domain="continuous" if h is None else "sampled", reason=str(reason), refused=True
-        )
-
+    if len(box.corners[0]) != plant.n:
+        raise ValueError(f"region needs {plant.n} signals, got {len(box.corners[0])}")
     if fault := jacobian_fault(plant, *box.corners):
         return refuse(fault)
     try:
@@ -98,17 +110,19 @@ def certify(
         centre = spaces(np.mean(box.corners, axis=0))
     except (ValueError, np.linalg.LinAlgError) as error:
         return refuse(f"{error}{_instead(plant, transforms)}")
+    if not isinstance(centre, AuxiliarySpace):
+        raise TypeError(f"transforms needs to return an AuxiliarySpace, got {centre!r}")
     if (centre.gains == 0).any():
         return refuse("R has a zero on its diagonal: some action does not move its own signal")
-    if kind == "frozen" and (callable(transforms) or not plant.constant):
-        return _frozen(policy, spaces, box, h)
     if callable(transforms) or not plant.constant:
-        answer = certify_exact(policy, plant, spaces, box, h=h, y_ref=y_ref)
+        if kind == "frozen":
+            return _frozen(policy, spaces, box, h)
+        answer = certify_exact(policy, plant, spaces, box, h=h, y_ref=y_ref, progress=progress)
         if answer.refused:
             return replace(answer, reason=f"{answer.reason}{_instead(plant, transforms)}")
         return answer
     try:
-        answer = _everywhere(policy, plant, centre, h, y_ref)
+        answer = _everywhere(policy, plant, centre, h, y_ref, progress)
     except TypeError:
         if region is None:
             raise
@@ -117,7 +131,7 @@ def certify(
         answer = refuse(error)
     if answer.holds or region is None or "wrong way" in answer.reason:
         return answer
-    inside = certify_exact(policy, plant, spaces, box, h=h, y_ref=y_ref)
+    inside = certify_exact(policy, plant, spaces, box, h=h, y_ref=y_ref, progress=progress)
     return replace(inside, reason=f"{inside.reason}. Not everywhere: {answer.reason}")
 
 
@@ -125,100 +139,135 @@ def _instead(plant: Any, transforms: Any) -> str:
     """Which other transforms fit the plant's box, as a clause, or ""."""
     if transforms is not None:
         return ""
-    found = [option.name for option in transforms_that_fit(plant) if option.possible]
-    if not found:
-        return ""
-    return f" (what fits: {', '.join(found)}; see combinations.transforms_that_fit)"
+    found = ", ".join(option.name for option in transforms_that_fit(plant) if option.possible)
+    return f" (what fits: {found}; see combinations.transforms_that_fit)" if found else ""
 
 
 def _everywhere(
-    policy: Any, plant: Any, space: AuxiliarySpace, h: float | None, y_ref: ArrayLike
+    policy: Any,
+    plant: Any,
+    space: AuxiliarySpace,
+    h: float | None,
+    y_ref: ArrayLike,
+    progress: Progress | None,
 ) -> Certificate:
     """All policies within the interval of the slopes, on a plant with constant Jacobians."""
     domain = "continuous" if h is None else "sampled"
 
     def no(reason: str, violated: Array | None = None) -> Certificate:
-        return Certificate(False, domain=domain, violated=violated, reason=reason)  # type: ignore[arg-type]
+        return Certificate(False, domain=domain, violated=violated, reason=reason)
 
     low, high = slope_interval(policy, space.gains)
-    if told := _wrong_sign(policy, space):
-        return no(told)
-    loop = BlockLoop(plant, space, low, high, h)
-    for i in range(space.n):
-        if high[i, 1] * low[i, 1] <= 0 and (low[i, 1] != 0 or high[i, 1] != 0):
+    if hasattr(policy, "slope_bounds"):
+        for i in np.flatnonzero(factor_of(policy, space.gains) * space.gains < 0):
             return no(
-                f"Dimension {i + 1}: the slope in int z has no floor above 0 (tanh saturates), so "
-                "no rate holds; a linear bypass (slope_min > 0) repairs it, or a region"
+                f"Dimension {i + 1}: the policy pushes the wrong way: it was told another sign of "
+                f"R than the plant's R = {space.gains[i]:.4g} (`ModularPolicy(R=...)`)"
             )
+    for i in np.flatnonzero((high * low <= 0)[:, 1] & ((low != 0) | (high != 0))[:, 1]):
+        return no(
+            f"Dimension {i + 1}: the slope in int z has no floor above 0 (tanh saturates), so no "
+            "rate holds; a linear bypass (slope_min > 0) repairs it, or a region"
+        )
+    loop = BlockLoop(plant, space, low, high, h)
     metrics, rates = [], []
     for block in loop.blocks:
         part = loop.block(block)
         if not part.holds:
-            names = " and ".join(str(i + 1) for i in block)
-            where = f"Dimension{'s' * (len(block) > 1)} {names}"
-            return no(f"{where}: {_hint(loop, block) or part.reason}", part.violated)
+            where = f"Dimension{'s' * (len(block) > 1)} {' and '.join(str(i + 1) for i in block)}"
+            return no(f"{where}: {part.reason}{_help(loop, block)}", part.violated)
         assert part.metric is not None
         metrics.append(part.metric)
         rates.append(part.rate)
     metric, rate = compose_hierarchical(metrics, rates, loop.couplings(), h=h)
     order = np.argsort(np.concatenate([loop.states(block) for block in loop.blocks]))
-    metric, reason = (
-        metric[np.ix_(order, order)],
-        "every dimension contracts, joined as a hierarchy",
-    )
+    metric = metric[np.ix_(order, order)]
+    reason = "every dimension contracts, joined as a hierarchy"
     if space.n > _MOST_MODES:
-        doubt = rate - rate_in(loop.matrix(low)[None], metric, h, loop.slack)
-        rate = min(rate, rate - doubt) if doubt > 0 else rate
+        rate = min(rate, rate_in(loop.matrix(low)[None], metric, h, loop.slack))
     else:
         corners = loop.corners(range(space.n))
-        found = common_metric(corners, h=h, slack=loop.slack)
+        found = common_metric(corners, h=h, slack=loop.slack, progress=progress)
         rate = rate_in(corners, metric, h, loop.slack)
         if found.holds and found.metric is not None:
             metric, rate = found.metric, found.rate
             reason = f"one metric for {len(corners)} corners of the slopes"
     if not rate > 0:
         return no("every dimension contracts, but rounding hides whether they do together")
-    answer = Certificate(True, domain=domain, rate=rate, metric=metric, reason=reason)  # type: ignore[arg-type]
+    answer = Certificate(True, domain=domain, rate=rate, metric=metric, reason=reason)
     return ball_everywhere(answer, policy, plant, space, (low, high), loop.keep, h, y_ref)
 
 
-def _wrong_sign(policy: Any, space: AuxiliarySpace) -> str:
-    """What a policy that was told another sign of R than the plant's should hear, or ""."""
-    if not hasattr(policy, "slope_bounds"):
+def _help(loop: BlockLoop, block: list[int]) -> str:
+    """What would make a block contract: its slopes (magnitudes) and where they would have to be."""
+    if len(block) > 2 or loop.n > _MOST_MODES:
         return ""
-    wrong = np.flatnonzero(factor_of(policy, space.gains) * space.gains < 0)
-    if not len(wrong):
-        return ""
-    i = int(wrong[0])
-    return (
-        f"Dimension {i + 1}: the policy pushes the wrong way: it was told another sign of R than "
-        f"the plant's R = {space.gains[i]:.4g} (`ModularPolicy(R=...)`)"
-    )
+    if len(block) == 1 and (bound := _bound(loop, block[0])):
+        return f"; {bound}"
+    turned = np.abs(loop.low) > np.abs(loop.high)
+    floor, cap = np.where(turned, loop.high, loop.low), np.where(turned, loop.low, loop.high)
+    tried, at = copy(loop), loop.states(block)
+
+    def holds(share: float, times: float = 1.0) -> bool:
+        """Whether slopes up to a share of the way from floor to cap, all `times` as large, fit."""
+        ends = times * np.stack([floor, floor + share * (cap - floor)])
+        tried.low, tried.high = ends.min(axis=0), ends.max(axis=0)
+        corners = tried.corners(block)[:, at[:, None], at]
+        return search_metric(corners, discrete=loop.h is not None)[0] is not None
+
+    def most(test: Callable[[float], bool]) -> float:
+        low, high = 0.0, 1.0
+        for _ in range(6):
+            middle = (low + high) / 2
+            low, high = (middle, high) if test(middle) else (low, middle)
+        return low
+
+    if holds(0.0):
+        caps = np.abs(floor + most(holds) * (cap - floor))[block]
+        shown = " and ".join(f"({p:.3g}, {q:.3g})" for p, q in caps)
+        return f"; lower the caps of the slopes in z and int z to {shown}"
+    if (times := most(lambda x: holds(1.0, x))) > 0:
+        return f"; lower all slopes to {times:.2g} times what they are"
+    raised = next((x for x in (2.0, 5.0, 20.0) if holds(1.0, x)), None)
+    return f"; raise all slopes to {raised:g} times what they are" if raised else ""
 
 
-def _hint(loop: BlockLoop, block: list[int]) -> str:
-    """Which slope to lower or raise, for one dimension in continuous time; else ""."""
-    if loop.h is not None or len(block) > 1:
-        return ""
-    i = block[0]
-    R, Lambda = loop.R[i, i], loop.Lambda[i, i]
+def _bound(loop: BlockLoop, i: int) -> str:
+    """The bound that slopes of one dimension break whatever the metric, or ""."""
+    h, R, Lambda = loop.h, loop.R[i, i], loop.Lambda[i, i]
     p, q = -R * np.stack([loop.low[i], loop.high[i]]).T  # loop gains, positive where they damp
-    if p.min() - Lambda <= 0 and q.min() >= 0:
-        return f"Lambda = {Lambda:.4g} 1/s demands a slope floor above {Lambda / abs(R):.4g} in z"
-    if q.min() > 0:
-        most = (p.min() - Lambda + np.sqrt(q.min())) ** 2 / abs(R)
-        if q.max() / abs(R) >= most:
+    size, grows = abs(R), Lambda if h is None else Lambda - 1.0  # per second, or per sample
+    if p.min() - grows <= 0 and q.min() >= 0:
+        return (
+            f"an open-loop growth of {Lambda:.4g} {'1/s' if h is None else 'a sample'} demands a "
+            f"slope floor above {grows / size:.4g} in z, it is {p.min() / size:.4g}"
+        )
+    if q.min() <= 0:
+        return ""
+    if h is not None:
+        most, reached = 1 + Lambda, p.max() + h / 2 * q.max()
+        if reached >= most:
             return (
-                f"no quadratic metric fits all slopes: the cap of the slope in int z, "
-                f"{q.max() / abs(R):.4g}, would have to be below {most:.4g}, or the floor in z "
-                "higher"
+                f"at this sample time the caps need (slope in z) + h/2 (slope in int z) below "
+                f"{most / size:.4g}, they reach {reached / size:.4g}: lower both to "
+                f"{most / reached:.2g} times, or sample faster"
             )
-    return ""
+        return ""
+    damping = p.min() - Lambda
+    most = (damping + np.sqrt(q.min())) ** 2
+    if q.max() < most:
+        return ""
+    floor = Lambda + np.sqrt(q.max()) - np.sqrt(q.min())
+    return (
+        f"no quadratic metric fits all slopes: lower the cap of the slope in int z from "
+        f"{q.max() / size:.4g} to below {most / size:.4g}, or raise the floor in z from "
+        f"{p.min() / size:.4g} to above {floor / size:.4g}"
+    )
 
 
 def _frozen(policy: Any, spaces: Transforms, box: Region, h: float | None) -> Certificate:
     """What each instant would have: one metric for the corners at a few points, and no proof."""
-    points = box.grid(3)
+    points = spread(*box.corners, 3)
     domain = "continuous" if h is None else "sampled"
     where = f"{box}, at {len(points)} points"
     try:
@@ -232,16 +281,15 @@ def _frozen(policy: Any, spaces: Transforms, box: Region, h: float | None) -> Ce
             ends = [np.unique(pair) for pair in np.stack([low, high], -1).reshape(-1, 2)]
             slopes = np.array(list(product(*ends))).reshape(-1, space.n, 2)
             here = replace(space, T_y=space.T_y[k], T_a=space.T_a[k], Lambda=Lambda, R=R)
-            if h is None:
-                vertices.append(here.loop(slopes))
-                continue
-            slopes[..., 0] += h * slopes[..., 1]
+            if h is not None:
+                slopes[..., 0] += h * slopes[..., 1]
             step = here.loop(slopes)
-            step[:, space.n :] = np.hstack([h * np.eye(space.n), np.eye(space.n)])
+            if h is not None:
+                step[:, space.n :] = np.hstack([h * np.eye(space.n), np.eye(space.n)])
             vertices.append(step)
         found = common_metric(np.concatenate(vertices), h=h)
     except (ValueError, np.linalg.LinAlgError) as error:
-        return Certificate(False, "frozen", domain, region=where, reason=str(error), refused=True)  # type: ignore[arg-type]
+        return Certificate(False, "frozen", domain, region=where, reason=str(error), refused=True)
     reason = (
         f"every instant by itself contracts (rate {found.rate:.3g} 1/s), which proves nothing "
         "where the transforms move; kind='exact' does"

@@ -12,6 +12,8 @@ the latent system driving the composition. Nothing about the robot is left: the 
 of gains. Matching coefficients gives A_lat K2 = lambda_d, A_lat K1 + B_lat K2 = K_d and
 B_lat K1 = K_p, a quadratic with two roots; the two rates K1/K2 and B_lat/A_lat are the two poles of
 the error equation, and the root says which of them belongs to the latent system.
+
+Wrong shapes, signs and sizes raise ValueError, or TypeError, with the argument's name.
 """
 
 from __future__ import annotations
@@ -22,10 +24,10 @@ from itertools import product
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from cmc.theory.arrays import Array, checked
+from cmc.theory.arrays import Array, checked, not_overflown, number, together
 from cmc.theory.certificates import Certificate, common_metric
 
 Root = Literal["small", "large"]
@@ -37,19 +39,12 @@ class InfeasibleGainsError(ValueError):
 
 @dataclass(frozen=True)
 class CompositeModel:
-    """Composite gains and the latent model that follows from them, one entry per axis.
+    """Composite gains and the latent model that follows, one entry per axis, (...,) each.
 
-    Every field is an array of the same shape (...,); diagonal matrices of the paper are stored as
-    their diagonals. Build it with `composite`.
-
-    Attributes:
-        lambda_d: coefficient of e'' (1 for acceleration-based control).
-        K_p: stiffness gain, 1/s^2 times the unit of `lambda_d`.
-        K_d: damping gain, 1/s times the unit of `lambda_d`.
-        K1: weight of the error in y, 1/s^2.
-        K2: weight of the error velocity in y, 1/s.
-        A_lat: coefficient of y' in the latent model.
-        B_lat: coefficient of y in the latent model.
+    lambda_d is the coefficient of e'' (1 for acceleration-based control), K_p [1/s^2] and K_d [1/s]
+    in its unit are stiffness and damping; y = K1 e + K2 e' with K1 in 1/s^2 and K2 in 1/s, and
+    A_lat y' + B_lat y + u = 0. Diagonal matrices of the paper are stored as their diagonals. Build
+    it with `composite`.
     """
 
     lambda_d: Array
@@ -75,27 +70,19 @@ class CompositeModel:
 
     @property
     def f_y(self) -> Array:
-        """Latent Jacobian df/dy = -B_lat / A_lat, negative, 1/s."""
+        """Latent Jacobian df/dy = -B_lat / A_lat, negative, 1/s (`LTI`)."""
         return -self.B_lat / self.A_lat
 
     @property
     def f_u(self) -> Array:
-        """Latent Jacobian df/du = -1 / A_lat, negative; it is R with T_y = T_a = I."""
+        """Latent Jacobian df/du = -1 / A_lat: R with T_y = T_a = I, so slopes are positive."""
         return -1.0 / self.A_lat
-
-    @property
-    def slope_sign(self) -> Array:
-        """Sign that dpi/ds must have on every axis: opposite to R, hence +1 (`inequal_1`)."""
-        return -np.sign(self.f_u)
 
     def y(self, e: ArrayLike, e_dot: ArrayLike) -> Array:
         """Composite variable K1 e + K2 e' (`mapping_pos`), (..., n), unit of e times 1/s^2."""
-        return self.K1 * np.asarray(e, dtype=float) + self.K2 * np.asarray(e_dot, dtype=float)
-
-    def y_dot(self, y: ArrayLike, u: ArrayLike) -> Array:
-        """Latent dynamics y' = -(B_lat y + u) / A_lat (`LTI`), shapes (..., n)."""
-        y = np.asarray(y, dtype=float)
-        return -(self.B_lat * y + np.asarray(u, dtype=float)) / self.A_lat  # LTI
+        e, v = checked("e", e, finite=False), checked("e_dot", e_dot, finite=False)
+        e, v, K1, K2 = together(e=e, e_dot=v, K1=self.K1, K2=self.K2)
+        return K1 * e + K2 * v  # a signal that has run away stays what it is
 
     def slope_cap(self, dt: float) -> Array:
         """Largest gain g = dpi/dy of u = g y that a torque held for `dt` seconds tolerates.
@@ -103,25 +90,11 @@ class CompositeModel:
         Holding K_p e + K_d e' + u over a step makes the error a sampled double integrator, stable
         only if (K_d + g K2) dt < 2 lambda_d (Jury's condition at z = -1). Beyond it the loop
         chatters at half the sampling rate. The sign rule alone knows no such bound.
-
-        Raises:
-            ValueError: unless `dt` is positive and finite.
         """
-        return (2.0 * self.lambda_d / _step(dt) - self.K_d) / self.K2
-
-    def sampled_stable(self, g: ArrayLike, dt: float) -> NDArray[np.bool_]:
-        """Whether u = g y, held for `dt` seconds, is stable on each axis: both Jury conditions.
-
-        (K_d + g K2) dt < 2 lambda_d and (K_p + g K1) dt < 2 (K_d + g K2); where K_p = 0 the
-        velocity alone is judged.
-
-        Raises:
-            ValueError: unless `dt` is positive and finite.
-        """
-        g = np.asarray(g, dtype=float)
-        k_v, k_x = self.K_d + g * self.K2, self.K_p + g * self.K1
-        slow = np.where(self.K_p > 0.0, (k_x > 0.0) & (k_x * dt < 2.0 * k_v), k_v > 0.0)
-        return (k_v * _step(dt) < 2.0 * self.lambda_d) & slow
+        with np.errstate(over="ignore"):
+            cap = (2.0 * self.lambda_d / number("dt", dt, above=0.0) - self.K_d) / self.K2
+        not_overflown("dt and K2", cap)
+        return cap
 
 
 def composite(
@@ -143,34 +116,38 @@ def composite(
 
     Raises:
         InfeasibleGainsError: where K_d^2 < 4 K_p lambda_d.
-        ValueError: for gains that are not finite, of the wrong sign, or do not broadcast.
     """
-    if root not in ("small", "large"):
+    if not isinstance(root, str) or root not in ("small", "large"):
         raise ValueError(f"root must be 'small' or 'large', got {root!r}")
-    kp, kd, lam = _gains(K_p, K_d, lambda_d)
-    discriminant = kd**2 - 4.0 * kp * lam
-    if np.any(discriminant < 0.0):
-        worst = np.unravel_index(np.argmin(discriminant), discriminant.shape)
-        axis = "" if not worst else f" on axis {', '.join(map(str, worst))}"
-        raise InfeasibleGainsError(
-            f"K_d^2 < 4 K_p lambda_d{axis}: K_p = {kp[worst]:g}, K_d = {kd[worst]:g}, "
-            f"lambda_d = {lam[worst]:g}; no real composite variable exists below "
-            f"K_d = {np.sqrt(4.0 * kp[worst] * lam[worst]):g}"
+    kp, kd, lam = (
+        gain.copy()
+        for gain in together(
+            K_p=checked("K_p", K_p, least=0.0),
+            K_d=checked("K_d", K_d, above=0.0),
+            lambda_d=checked("lambda_d", lambda_d, above=0.0),
         )
-    sum_ = kd + np.sqrt(discriminant)
-    # 2 K_p / (K_d - s) loses digits for small K_p; (K_d + s) / (2 lambda_d) is the same number.
-    k2 = 2.0 * kp / sum_ if root == "small" else sum_ / (2.0 * lam)
-    rigid = kp == 0.0
-    K2 = np.where(rigid, 1.0, k2)
-    return CompositeModel(
-        lambda_d=lam,
-        K_p=kp,
-        K_d=kd,
-        K1=kp / lam,
-        K2=K2,
-        A_lat=lam / K2,  # lambda_b_1, lambda_b_2
-        B_lat=np.where(rigid, kd, lam),  # lambda_b_1, lambda_b_2
     )
+    with np.errstate(all="ignore"):
+        square, twin = kd**2, 4.0 * kp * lam
+        not_overflown("K_d", square, 1.0 / square)
+        not_overflown("K_p and lambda_d", twin)
+        discriminant = square - twin
+        if np.any(discriminant < 0.0):
+            worst = np.unravel_index(np.argmin(discriminant), discriminant.shape)
+            axis = "" if not worst else f" on axis {', '.join(map(str, worst))}"
+            raise InfeasibleGainsError(
+                f"K_d^2 < 4 K_p lambda_d{axis}: K_p = {kp[worst]:g}, K_d = {kd[worst]:g}, "
+                f"lambda_d = {lam[worst]:g}; no real composite variable exists below "
+                f"K_d = {np.sqrt(twin[worst]):g}"
+            )
+        sum_, rigid = kd + np.sqrt(discriminant), kp == 0.0
+        # 2 K_p / (K_d - s) loses digits for small K_p; (K_d + s) / (2 lambda_d) is the same number.
+        K2 = np.where(rigid, 1.0, 2.0 * kp / sum_ if root == "small" else sum_ / (2.0 * lam))
+        K1, A_lat, B_lat = kp / lam, lam / K2, np.where(rigid, kd, lam)  # lambda_b_1, lambda_b_2
+        model = CompositeModel(lam, kp, kd, K1, K2, A_lat, B_lat)
+        rates = (model.latent_rate, model.composition_rate, model.f_u)
+    not_overflown("K_p, K_d and lambda_d", K1, K2, A_lat, *rates)
+    return model
 
 
 def certify_latent(
@@ -197,20 +174,25 @@ def certify_latent(
             `CompositeModel` is the hand-made one.
         policy: Has `slope_bounds()`, slopes of u in (y, int y), (n, 2); without integral where the
             second are zero.
-        K_p: Stiffness gains, broadcast to (n,).
-        K_d: Damping gains, broadcast to (n,).
-        lambda_d: Coefficient of e'', broadcast to (n,).
+        K_p: Stiffness gains, broadcast to (n,) like K_d and lambda_d.
+        K_d: Damping gains.
+        lambda_d: Coefficient of e'', positive.
         h: Sample time, s.
 
     Returns:
         A certificate in (e_1, e_1', int y_1, e_2, ...), the rate that of the slowest axis.
     """
-    low, high = (checked("signal", x, "n 2") for x in _slopes(signal))
-    least, most = (checked("policy", x, "n 2", n=len(low)) for x in _slopes(policy))
-    gains = [
-        np.broadcast_to(checked(name, x), (len(low),))
-        for name, x in (("K_p", K_p), ("K_d", K_d), ("lambda_d", lambda_d))
-    ]
+    low, high = _slopes("signal", signal)
+    least, most = _slopes("policy", policy, n=len(low))
+    h = None if h is None else number("h", h, above=0.0)
+    gains = together(
+        signal=low[:, 0],
+        K_p=checked("K_p", K_p),
+        K_d=checked("K_d", K_d),
+        lambda_d=checked("lambda_d", lambda_d, above=0.0),
+    )[1:]
+    if gains[0].shape != low[:, 0].shape:
+        raise ValueError(f"K_p, K_d, lambda_d need shape {low[:, 0].shape}, got {gains[0].shape}")
     metrics, rates = [], []
     for i, (kp, kd, lam) in enumerate(zip(*gains, strict=True)):
         ends = [
@@ -235,11 +217,16 @@ def certify_latent(
     )
 
 
-def _slopes(part: Any) -> tuple[ArrayLike, ArrayLike]:
+def _slopes(name: str, part: Any, **sizes: Any) -> tuple[Array, Array]:
+    """Lower and upper slopes, (n, 2) each."""
     if isinstance(part, CompositeModel):
-        weights = np.stack([np.atleast_1d(part.K1), np.atleast_1d(part.K2)], axis=-1)
-        return weights, weights
-    return part.slope_bounds()  # type: ignore[no-any-return]
+        bounds = [np.stack([np.atleast_1d(part.K1), np.atleast_1d(part.K2)], axis=-1)] * 2
+    elif hasattr(part, "slope_bounds"):
+        bounds = part.slope_bounds()
+    else:
+        raise TypeError(f"{name} needs slope_bounds() -> (lower, upper), got {part!r}")
+    low, high = (checked(f"{name}.slope_bounds()", bound, "n 2", **sizes) for bound in bounds)
+    return low, high
 
 
 def _latent_jacobian(
@@ -254,37 +241,3 @@ def _latent_jacobian(
     command = np.array([kp + p * a, kd + p * b, q])
     free = np.array([[1, h, 0], [0, 1, 0], [h * a, h * b, 1]], dtype=float)
     return free - np.array([[h * h / 2], [h], [0]]) * command
-
-
-def feasible(K_p: ArrayLike, K_d: ArrayLike, lambda_d: ArrayLike = 1.0) -> NDArray[np.bool_]:
-    """Whether a real composite variable exists: K_d^2 >= 4 K_p lambda_d, elementwise.
-
-    Raises:
-        ValueError: as `composite`.
-    """
-    kp, kd, lam = _gains(K_p, K_d, lambda_d)
-    return kd**2 >= 4.0 * kp * lam
-
-
-def _gains(K_p: ArrayLike, K_d: ArrayLike, lambda_d: ArrayLike) -> tuple[Array, Array, Array]:
-    """Three gains as float arrays of one shape, checked."""
-    try:
-        kp, kd, lam = np.broadcast_arrays(
-            *(np.asarray(gain, dtype=float) for gain in (K_p, K_d, lambda_d))
-        )
-    except ValueError as error:
-        shapes = [np.shape(gain) for gain in (K_p, K_d, lambda_d)]
-        raise ValueError(f"K_p, K_d, lambda_d must broadcast together, got {shapes}") from error
-    for name, gain in (("K_p", kp), ("K_d", kd), ("lambda_d", lam)):
-        if not np.all(np.isfinite(gain)):
-            raise ValueError(f"{name} must be finite, got {gain}")
-        if np.any(gain < 0.0) or (name != "K_p" and np.any(gain == 0.0)):
-            wanted = ">= 0" if name == "K_p" else "> 0"
-            raise ValueError(f"{name} must be {wanted}, got {gain}")
-    return kp.copy(), kd.copy(), lam.copy()
-
-
-def _step(dt: float) -> float:
-    if not (np.isfinite(dt) and dt > 0.0):
-        raise ValueError(f"dt must be positive and finite, got {dt}")
-    return float(dt)

@@ -1,225 +1,157 @@
-"""Contraction: how fast trajectories forget where they started, measured and derived.
+"""Contraction: the differential dynamics in the auxiliary space, and rates in a metric.
+
+With `a = pi(z, int z)` one network a dimension, `d/dt (dz, da) = F (dz, da)`. Throughout, `slopes`
+has shape (..., n, 2) and holds d pi_i / d s_1i (towards z_i) and d pi_i / d s_2i (towards int z_i),
+signs included, and `T_y_dot` is the time derivative of T_y [1/s], (..., n, n). The change of the
+slopes themselves is dropped, as in the paper: what F says is about one frozen instant;
+`cmc.theory.certificates` says when instants add up to a guarantee.
 
 A system contracts at `rate` > 0 if the distance of any two trajectories obeys
 
-    d(t) <= overshoot e^{-rate t} d(0).
+    d(t) <= overshoot e^{-rate t} d(0),
 
-Measured: `rate_from_cloud` fits the two numbers to simulated trajectories.
-Derived: `contraction_rate` reads the rate off the differential dynamics in a metric, which also
-bounds the overshoot by sqrt(cond(M)). The first sees what happened, the second what must happen.
-(appendix A; Lohmiller and Slotine, Automatica 34, 1998.)
+which holds where J^T M + M J <= -2 rate M, with an overshoot of at most sqrt(cond(M)) (appendix A;
+Lohmiller and Slotine, Automatica 34, 1998). A metric that is not symmetric positive definite, wrong
+shapes and wrong numbers raise ValueError, or TypeError, with the argument's name.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_lyapunov
 
-from cmc.theory.arrays import Array, checked, count, number
+from cmc.theory.arrays import Array, checked, inverse, not_overflown, number, together
+from cmc.theory.auxiliary import AuxiliarySpace
 
-_MAX_PAIRS = 4000
+
+class Blocks(NamedTuple):
+    """The four blocks of F, each (..., n, n), in 1/s, up to the units of the action."""
+
+    A_blk: Array
+    B_blk: Array
+    C_blk: Array
+    D_blk: Array
 
 
-@dataclass(frozen=True)
-class Decay:
-    """d(t) <= overshoot e^{-rate t} d(0), fitted to trajectories.
+def blocks(space: AuxiliarySpace, slopes: ArrayLike, T_y_dot: ArrayLike | None = None) -> Blocks:
+    """Return the blocks of the differential dynamics (inverse_solution).
 
-    Attributes:
-        rate: Contraction rate, 1/s; negative where the distance grows.
-        overshoot: Smallest constant, at least 1, for which the bound holds at every sample.
-        ratio: Largest distance at each time over the initial one, (T,).
-        times: The times of the samples, s, (T,).
+    `A = T_y' T_y^-1 + Lambda`, `B = R`, `C = Pi_1 A + Pi_2`, `D = Pi_1 B`, Pi_j the diagonal
+    matrices of slopes; `T_y_dot` is zero by default.
     """
+    s = checked("slopes", slopes, "... n 2", n=space.n)
+    A_blk, B_blk = space.Lambda, space.R
+    if T_y_dot is not None:
+        rate, frozen = together(T_y_dot=_frame_rate(space, T_y_dot), space=A_blk)
+        A_blk = rate + frozen
+    A_blk, B_blk, pi_1 = together(T_y_dot=A_blk, space=B_blk, slopes=s[..., 0, None])
+    C_blk, D_blk = pi_1 * A_blk + s[..., 1, None] * np.eye(space.n), pi_1 * B_blk
+    not_overflown("slopes and T_y_dot", A_blk, C_blk, D_blk)
+    return Blocks(A_blk, B_blk, C_blk, D_blk)
 
-    rate: float
-    overshoot: float
-    ratio: Array
-    times: Array
 
-    @property
-    def bound(self) -> Array:
-        """The fitted bound overshoot e^{-rate t} at `times`, (T,)."""
-        return self.overshoot * np.exp(-self.rate * (self.times - self.times[0]))
+def F(space: AuxiliarySpace, slopes: ArrayLike, T_y_dot: ArrayLike | None = None) -> Array:
+    """Return F of `d/dt (dz, da) = F (dz, da)`, (..., 2n, 2n), ordered z_1..z_n, a_1..a_n (F).
 
-
-def rate_from_cloud(times: ArrayLike, paths: ArrayLike, metric: ArrayLike | None = None) -> Decay:
-    """Fit rate and overshoot to the worst pair of a cloud of trajectories.
-
-    The ratio d_ij(t) / d_ij(0) is taken over all pairs (a fixed random 4000 of them if there are
-    more), its largest value at each time is replaced by its monotone envelope, so that a distance
-    that swings through zero does not count as small, and the log of that is fitted by a line over
-    the second half of the decay. The overshoot then makes the bound hold at every sample.
-
-    Args:
-        times: Increasing times, s, (T,) with T >= 3.
-        paths: Trajectories, (T, N, n) with N >= 2.
-        metric: Positive definite M of the distance, (n, n); identity by default.
-
-    Raises:
-        ValueError: for wrong shapes, values that are not finite, or equal starts.
+    Without `T_y_dot` the transforms are held: the paper's F_1.
     """
-    times = checked("times", times, "time")
-    if len(times) < 3 or not (np.diff(times) > 0).all():
-        raise ValueError("times needs at least 3 increasing values")
-    paths = checked("paths", paths, "time N n", time=len(times))
-    if paths.shape[1] < 2:
-        raise ValueError(f"paths needs shape ({len(times)}, N >= 2, n), got {paths.shape}")
-    i, j = np.triu_indices(paths.shape[1], 1)
-    if len(i) > _MAX_PAIRS:
-        keep = np.random.default_rng(0).choice(len(i), _MAX_PAIRS, replace=False)
-        i, j = i[keep], j[keep]
-    difference = paths[:, i] - paths[:, j]
-    if metric is not None:
-        difference = difference @ metric_factor(metric).T
-    distance = np.linalg.norm(difference, axis=-1)
-    if (distance[0] == 0).any():
-        raise ValueError("two trajectories have the same start; their distance says nothing")
-    return _fit(times, (distance / distance[0]).max(axis=1))
+    A_blk, B_blk, C_blk, D_blk = blocks(space, slopes, T_y_dot)
+    return np.block([[A_blk, B_blk], [C_blk, D_blk]])
 
 
-def _fit(times: Array, ratio: Array) -> Decay:
-    growing = int(np.argmax(ratio)) > len(ratio) // 2
-    envelope = np.maximum.accumulate(ratio) if growing else np.maximum.accumulate(ratio[::-1])[::-1]
-    # below the floor the difference of two nearly equal numbers is rounding, not distance
-    usable = envelope > 1e-11
-    last = int(usable.sum())
-    if last < 3:
-        raise ValueError("the distance vanishes within two samples: sample more finely")
-    late = slice(last // 2, last) if last >= 6 else slice(0, last)
-    rate = -float(np.polyfit(times[late], np.log(envelope[late]), 1)[0])
-    scaled = ratio[:last] * np.exp(rate * (times[:last] - times[0]))
-    return Decay(rate=rate, overshoot=float(scaled.max()), ratio=ratio, times=times)
+def F2(space: AuxiliarySpace, slopes: ArrayLike, T_y_dot: ArrayLike) -> Array:
+    """Return the part of F that the moving transform adds, F - F_1 (F2), (..., 2n, 2n)."""
+    pi_1 = checked("slopes", slopes, "... n 2", n=space.n)[..., 0, None]
+    left, pi_1 = together(T_y_dot=_frame_rate(space, T_y_dot), slopes=pi_1)
+    zero = np.zeros(left.shape)
+    not_overflown("slopes and T_y_dot", left, pi_1 * left)
+    return np.block([[left, zero], [pi_1 * left, zero]])
+
+
+def _frame_rate(space: AuxiliarySpace, T_y_dot: ArrayLike) -> Array:
+    """T_y' T_y^-1 [1/s]."""
+    dot = checked("T_y_dot", T_y_dot, "... n n", n=space.n)
+    return np.matmul(*together(T_y_dot=dot, space=space.V))
+
+
+def Theta_M(space: AuxiliarySpace) -> Array:
+    """Return diag(T_y, T_a^-1), (..., 2n, 2n), which maps (y, u) to (z, a) (theta_m).
+
+    Its square `Theta_M^T Theta_M` is the metric in (y, u) that the identity in (z, a) becomes.
+    """
+    zero = np.zeros(space.T_y.shape)
+    return np.block([[space.T_y, zero], [zero, inverse("T_a", space.T_a)]])
+
+
+def subsystems(matrix: ArrayLike) -> Array:
+    """Return all 2x2 blocks of F, (..., n, n, 2, 2): entry i, j is [[a_ij, b_ij], [c_ij, d_ij]].
+
+    The self-feedback of module i is entry i, i (selffeedback), what module j does to module i is
+    entry i, j (coupling). `matrix` is F, (..., 2n, 2n), in the order z_1..z_n, a_1..a_n.
+    """
+    array = checked("matrix", matrix, "... 2n 2n")
+    n = array.shape[-1] // 2
+    if array.shape[-1] % 2:
+        raise ValueError(f"matrix needs shape (..., 2n, 2n), got shape {array.shape}")
+    split = array.reshape(*array.shape[:-2], 2, n, 2, n)
+    return np.moveaxis(split, (-3, -1), (-4, -3))
 
 
 def metric_factor(metric: ArrayLike) -> Array:
-    """Upper triangular Theta with M = Theta^T Theta, (..., n, n).
-
-    Raises:
-        ValueError: if the metric is not symmetric positive definite.
-    """
+    """Upper triangular Theta with M = Theta^T Theta, (..., n, n)."""
     metric = checked("metric", metric, "... n n")
     flipped = np.swapaxes(metric, -1, -2)
-    if not np.allclose(metric, flipped, rtol=1e-6):
+    if not np.allclose(metric, flipped, rtol=1e-6, atol=1e-9 * np.abs(metric).max(initial=0.0)):
         raise ValueError("a metric needs to be symmetric")
+    even = metric / 2 + flipped / 2
     try:
-        factor = np.linalg.cholesky((metric + flipped) / 2)
-        return np.asarray(np.swapaxes(factor, -1, -2), dtype=np.float64)
+        return np.asarray(np.swapaxes(np.linalg.cholesky(even), -1, -2))
     except np.linalg.LinAlgError:
-        lowest = float(np.linalg.eigvalsh((metric + flipped) / 2).min())
+        lowest = float(np.linalg.eigvalsh(even).min())
         raise ValueError(
             f"a metric needs to be positive definite; its smallest eigenvalue is {lowest:.3g}"
         ) from None
 
 
-def matrix_measure(J: ArrayLike, norm: float = 2) -> Array:
-    """Logarithmic norm mu(J) = lim (||I + h J|| - 1) / h, (...,), 1/s.
+def contraction_rate(J: ArrayLike, metric: ArrayLike | None = None) -> Array:
+    """Rate that the differential dynamics have in a constant metric, (...,), 1/s.
 
-    The fastest growth of any distance in that norm: mu_2 is the largest eigenvalue of the symmetric
-    part, mu_inf and mu_1 sum the absolute values off the diagonal along rows and columns.
-
-    Raises:
-        ValueError: if `norm` is not 1, 2 or infinity.
+    The largest beta with J^T M + M J <= -2 beta M: minus the largest eigenvalue of the symmetric
+    part of Theta J Theta^-1, M = Theta^T Theta. J and M are (..., n, n), M = I by default.
     """
-    J = checked("J", J, "... n n")
-    if norm == 2:
-        rate = np.linalg.eigvalsh((J + np.swapaxes(J, -1, -2)) / 2)[..., -1]
-        return np.asarray(rate, dtype=np.float64)
-    if norm not in (1, np.inf):
-        raise ValueError(f"norm needs to be 1, 2 or infinity, got {norm}")
-    diagonal = np.diagonal(J, axis1=-2, axis2=-1)
-    off = np.abs(J).sum(axis=-1 if norm == np.inf else -2) - np.abs(diagonal)
-    return (diagonal + off).max(axis=-1)
-
-
-def contraction_rate(
-    J: ArrayLike, metric: ArrayLike | None = None, metric_dot: ArrayLike | None = None
-) -> Array:
-    """Rate that the differential dynamics have in a metric, (...,), 1/s.
-
-    The largest beta with J^T M + M J + M' <= -2 beta M, that is -mu_2 of the generalised Jacobian
-    (Theta' + Theta J) Theta^-1 with M = Theta^T Theta.
-
-    Args:
-        J: Jacobians, (..., n, n).
-        metric: M, (..., n, n); identity by default.
-        metric_dot: Derivative of M along the trajectory, (..., n, n); zero by default.
-
-    Raises:
-        ValueError: if the metric is not symmetric positive definite.
-    """
-    J = checked("J", J, "... n n")
-    if metric is None:
-        return -matrix_measure(J)
-    theta = metric_factor(metric)
-    inverse = np.linalg.inv(theta)
-    generalised = theta @ J @ inverse
-    if metric_dot is not None:
-        moving = checked("metric_dot", metric_dot, "... n n", n=J.shape[-1])
-        turn = np.swapaxes(inverse, -1, -2) @ moving @ inverse
-        generalised = generalised + turn / 2
-    return -matrix_measure(generalised)
-
-
-def contraction_factor(transition: ArrayLike, metric: ArrayLike) -> Array:
-    """Factor by which one step of a sampled loop shrinks distances in a metric, (...,).
-
-    The spectral norm of Theta Phi Theta^-1: below 1 the step contracts.
-    """
-    theta = metric_factor(metric)
-    return np.linalg.norm(
-        theta @ checked("transition", transition, "... n n") @ np.linalg.inv(theta),
-        2,
-        axis=(-2, -1),
-    )
+    given = checked("J", J, "... n n")
+    if metric is not None:
+        metric = checked("metric", metric, "... n n", n=given.shape[-1])
+        given, theta = together(J=given, metric=metric_factor(metric))
+        given = theta @ given @ np.linalg.inv(theta)
+    not_overflown("J and metric", given)
+    symmetric = (given + np.swapaxes(given, -1, -2)) / 2
+    return np.asarray(-np.linalg.eigvalsh(symmetric)[..., -1], dtype=float)
 
 
 def lyapunov_metric(J: ArrayLike, rate: float = 0.0) -> Array:
-    """Metric in which a constant Jacobian contracts faster than `rate`, (n, n).
+    """Metric in which a constant Jacobian contracts faster than `rate` in 1/s, (n, n).
 
-    Solves (J + rate I)^T M + M (J + rate I) = -I, scaled to a smallest eigenvalue of 1.
-
-    Raises:
-        ValueError: if some eigenvalue of J has a real part of -rate or more.
+    Solves (J + rate I)^T M + M (J + rate I) = -I, scaled to a smallest eigenvalue of 1; every
+    eigenvalue of J needs a real part below -rate.
     """
     J, rate = checked("J", J, "n n"), number("rate", rate)
     slowest = float(np.linalg.eigvals(J).real.max())
     if slowest >= -rate:
         raise ValueError(
-            f"no metric contracts at {rate:g} 1/s: an eigenvalue has real part {slowest:.4g} 1/s"
+            f"no metric contracts J at {rate:g} 1/s: an eigenvalue has real part {slowest:.4g} 1/s"
         )
     shifted = J + rate * np.eye(len(J))
     metric = solve_continuous_lyapunov(shifted.T, -np.eye(len(J)))
     metric = (metric + metric.T) / 2
-    return metric / np.linalg.eigvalsh(metric)[0]
+    metric = metric / np.linalg.eigvalsh(metric)[0]
+    not_overflown("J and rate", metric)
+    return metric
 
 
 def overshoot(metric: ArrayLike) -> Array:
     """Bound on the Euclidean transient that a metric allows: sqrt(cond(M)), (...,)."""
-    return np.sqrt(np.linalg.cond(checked("metric", metric, "... n n")))
-
-
-def floquet_multipliers(jacobian: Callable[[float], Array], period: float, n: int = 2) -> Array:
-    """Eigenvalues of the map over one period of s' = J(t) s, complex, (n,), largest first.
-
-    A periodic linear system decays exactly if all of them lie inside the unit circle; eigenvalues
-    of J at single instants decide nothing.
-
-    Args:
-        jacobian: J(t), (n, n), with the given period.
-        period: Period, s.
-        n: Size of J.
-    """
-    period, n = number("period", period, above=0.0), count("n", n, 100)
-    checked("jacobian(0)", jacobian(0.0), "n n", n=n)
-
-    def variational(t: float, flat: Array) -> Array:
-        return (jacobian(t) @ flat.reshape(n, n)).ravel()
-
-    end = solve_ivp(variational, (0.0, period), np.eye(n).ravel(), rtol=1e-10, atol=1e-12)
-    multipliers = np.linalg.eigvals(end.y[:, -1].reshape(n, n)).astype(complex)
-    return multipliers[np.argsort(-np.abs(multipliers))]
+    return np.linalg.cond(metric_factor(metric))

@@ -17,17 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import Array, checked
+from cmc.theory.arrays import Array, checked, count
 from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.ball import ball_in_box
-from cmc.theory.certificates import Certificate, Domain, common_metric, rates_in
-from cmc.theory.jacobians import differences
+from cmc.theory.certificates import Certificate, Progress, common_metric, rates_in
+from cmc.theory.identification import differences
+from cmc.theory.metric_search import search_metric
 from cmc.theory.simulate import Loop
 from cmc.theory.tracking import jumps
-
-total_jacobian = differences
-
-Transforms = Callable[[Array], AuxiliarySpace]
 
 _ROUNDS = 5
 _GRID = 1024
@@ -57,12 +54,12 @@ class Region:
         low = checked("y_low", self.y_low, "n")
         high = checked("y_high", self.y_high, "n", n=len(low))
         if not (low < high).all():
-            raise ValueError(f"a region needs y_low < y_high, both (n,), got {low} and {high}")
+            raise ValueError(f"y_high needs values above y_low, (n,) both, got {low} and {high}")
         reach = checked("integral", self.integral, above=0.0)
         if reach.shape not in ((), low.shape):
-            raise ValueError(f"integral needs one number or ({len(low)},), got {reach.shape}")
-        if not 2 <= self.points <= 101:
-            raise ValueError(f"points needs 2 to 101 points per axis, got {self.points}")
+            raise ValueError(f"integral needs one number or ({len(low)},), got shape {reach.shape}")
+        if count("points", self.points, 101) < 2:
+            raise ValueError("points needs at least 2 points per axis, got 1")
 
     @property
     def corners(self) -> tuple[Array, Array]:
@@ -76,22 +73,13 @@ class Region:
         reach = np.broadcast_to(np.asarray(self.integral, dtype=float), low.shape)
         return np.concatenate([low, -reach]), np.concatenate([high, reach])
 
-    def check(self, n: int) -> None:
-        """Refuse another number of signals than `n`."""
-        if len(self.corners[0]) != n:
-            raise ValueError(f"region needs {n} signals, got {len(self.corners[0])}")
-
-    def grid(self, points: int | None = None) -> Array:
-        """Latent signals, (N, n): a grid where it has at most 1024 points, else spread evenly."""
-        return _spread(*self.corners, self.points if points is None else points)
-
     def __str__(self) -> str:
         box = " x ".join(f"[{a:.3g}, {b:.3g}]" for a, b in zip(*self.corners, strict=True))
         return f"y in {box}"
 
 
-def _spread(low: Array, high: Array, points: int) -> Array:
-    """A grid of at most 1024 points; corners and random points where it would have more."""
+def spread(low: Array, high: Array, points: int) -> Array:
+    """A grid of at most 1024 points (N, m); corners and random ones where it would have more."""
     m = len(low)
     if points**m <= _GRID:
         axes = [np.linspace(a, b, points) for a, b in zip(low, high, strict=True)]
@@ -103,116 +91,108 @@ def _spread(low: Array, high: Array, points: int) -> Array:
     return np.asarray(low + unit * (high - low))
 
 
-def closed_loop(
-    policy: Any,
-    plant: Any,
-    spaces: Transforms,
-    *,
-    y_ref: ArrayLike = 0.0,
-    h: float | None = None,
-) -> Callable[[Array], Array]:
-    """Vector field of `cmc.theory.simulate.Loop` in (y, int z), or with `h` its step."""
-    loop = Loop(plant, policy, spaces, y_ref)
-    return (lambda s: loop.field(0.0, s)) if h is None else (lambda s: loop.step(s, h))
-
-
 def certify_exact(
     policy: Any,
     plant: Any,
-    spaces: Transforms,
+    spaces: Callable[[Array], AuxiliarySpace],
     region: Region,
     *,
     h: float | None = None,
     y_ref: ArrayLike = 0.0,
+    progress: Progress | None = None,
 ) -> Certificate:
-    """Exact certificate of one policy over a box of (y, int z).
+    """Exact certificate of one policy over a box of (y, int z); arguments as in `certify`.
 
     One metric is sought for the total Jacobians at 1024 points or so, then tried at 2048 others and
-    around the worst of all; what fails joins the vertices, a few rounds at most.
-
-    Args:
-        policy: As in `cmc.theory.simulate.closed_loop`.
-        plant: As there.
-        spaces: Transforms as a function of y.
-        region: The box.
-        h: Sample time, s; continuous without it.
-        y_ref: Where the latent signal is to go, (n,).
-
-    Returns:
-        A certificate whose metric is in (y, int z), or in y alone where the policy does not use
-        int z; refused where the policy cannot be evaluated or a transform jumps.
+    around the worst of all; what fails joins the vertices, a few rounds at most. The metric is in
+    (y, int z), or in y alone where the policy does not use int z.
     """
-    domain: Domain = "continuous" if h is None else "sampled"
+    domain = "continuous" if h is None else "sampled"
     where = f"{region}, |int z| at most {np.asarray(region.integral).tolist()}"
-
-    def refuse(reason: object) -> Certificate:
-        return Certificate(False, "exact", domain, region=where, reason=str(reason), refused=True)
-
     n, (low, high) = plant.n, region.limits
-    step, rng = 1e-6 * (high - low), np.random.default_rng(0)
     try:
         if jumps(spaces, *region.corners):
-            return refuse(
+            raise ValueError(
                 "T_y jumps inside the region (order or sign of its eigenvectors): track them along "
                 "the path, or shrink the region"
             )
         loop = Loop(plant, policy, spaces, y_ref)
-        keep = slice(2 * n) if _integrates(loop, low, high) else slice(n)
+        keep = np.arange(2 * n if _integrates(loop, low, high) else n)
+        look = _Looked(loop, keep, low, high, h, min(region.points, int(_GRID ** (1 / (2 * n)))))
+        answer, rates, points, jacobians = look.certificate(progress)
+        answer = replace(answer, evidence="points")
+    except (ValueError, TypeError, np.linalg.LinAlgError) as error:
+        return Certificate(False, "exact", domain, region=where, reason=str(error), refused=True)
+    if answer.metric is None or rates.min() <= 0:
+        k = int(np.argmin(rates))
+        reason = "metrics that fit the grid fail between" if answer.metric is not None else ""
+        at = f", at y = {_text(points[k, :n])}, int z = {_text(points[k, n:])}"
+        reason = (reason or answer.reason) + at + look.smaller()
+        no = Certificate(False, "exact", domain, region=where, reason=reason, evidence="points")
+        return replace(no, violated=jacobians[k])
+    rate, seen = min(answer.rate, float(rates.min())), len(look.points) + len(points)
+    reason = f"one metric at all {seen} points of the box that were looked at, while the "
+    answer = replace(answer, rate=rate, region=where, reason=f"{reason}trajectories stay in it")
+    return ball_in_box(answer, loop, keep, low, high, h)
 
-        def jacobians(s: Array) -> Array:
-            move = (lambda x: loop.field(0.0, x)) if h is None else (lambda x: loop.step(x, h))
-            J = differences(move, s, step)[:, keep, keep]
-            if not np.isfinite(J).all():
-                bad = s[np.flatnonzero(~np.isfinite(J).all(axis=(1, 2)))[0], :n]
-                raise ValueError(f"the loop is not finite at y = {bad}")
-            return J
 
-        points = _spread(low, high, min(region.points, int(_GRID ** (1 / (2 * n)))))
-        vertices, answer = jacobians(points), None
-        for _ in range(_ROUNDS):
-            answer = common_metric(vertices, h=h)
+class _Looked:
+    """Points of a box (y, int z), and the total Jacobians of a loop at them."""
+
+    def __init__(
+        self, loop: Loop, keep: Array, low: Array, high: Array, h: float | None, points: int
+    ) -> None:
+        self.keep, self.low, self.high, self.h = keep, low, high, h
+        self.move: Callable[[Array], Array] = (
+            (lambda x: loop.field(0.0, x)) if h is None else (lambda x: loop.step(x, h))
+        )
+        self.points = spread(low, high, points)
+        self.jacobians = self.at(self.points)
+
+    def at(self, s: Array) -> Array:
+        J = differences(self.move, s, 1e-6 * (self.high - self.low))
+        J = J[:, self.keep[:, None], self.keep]
+        bad = ~np.isfinite(J).all(axis=(1, 2))
+        if bad.any():
+            where = _text(s[np.flatnonzero(bad)[0], : len(self.low) // 2])
+            raise ValueError(f"the loop is not finite at y = {where}")
+        return J
+
+    def certificate(self, progress: Progress | None) -> tuple[Certificate, Array, Array, Array]:
+        """The best answer; rates, points and Jacobians that it was tried at, or what resists it."""
+        rng, low, high = np.random.default_rng(0), self.low, self.high
+        for turn in range(_ROUNDS):
+            if progress is not None:
+                progress(f"box, round {turn + 1}: Jacobians at {len(self.points)} points")
+            answer = common_metric(self.jacobians, h=self.h, progress=progress)
             if answer.metric is None:
-                break
-            near = points[np.argsort(rates_in(vertices, answer.metric, h))[:64]]
+                assert answer.violated is not None
+                away = np.abs(self.jacobians - answer.violated).max(axis=(1, 2))
+                return answer, away, self.points, self.jacobians
+            worst = np.argsort(rates_in(self.jacobians, answer.metric, self.h))[:64]
+            near = self.points[worst]
             around = near + rng.normal(size=(8, *near.shape)) * 0.05 * (high - low)
-            tried = np.concatenate(
-                [rng.uniform(low, high, (_CHECKS, 2 * n)), around.reshape(-1, 2 * n)]
-            )
-            tried = np.clip(tried, low, high)
-            checks = jacobians(tried)
-            rates = rates_in(checks, answer.metric, h)
-            if rates.min() > 0.3 * answer.rate:
+            others = rng.uniform(low, high, (_CHECKS, len(low)))
+            tried = np.clip(np.concatenate([others, around.reshape(-1, len(low))]), low, high)
+            checks = self.at(tried)
+            rates = rates_in(checks, answer.metric, self.h)
+            if rates.min() > 0.3 * answer.rate or turn == _ROUNDS - 1:
                 break
             worst = np.argsort(rates)[:20]
-            points = np.concatenate([points, tried[worst]])
-            vertices = np.concatenate([vertices, checks[worst]])
-    except (ValueError, TypeError, np.linalg.LinAlgError) as error:
-        return refuse(error)
-    if answer is None or answer.metric is None or rates.min() <= 0:
-        assert answer is not None
-        reason = (
-            answer.reason if answer.metric is None else "metrics that fit the grid fail between"
-        )
-        violated = answer.violated if answer.metric is None else checks[int(np.argmin(rates))]
-        return Certificate(
-            False,
-            "exact",
-            domain,
-            violated=violated,
-            region=where,
-            reason=reason,
-            evidence="points",
-        )
-    answer = replace(
-        answer,
-        kind="exact",
-        rate=min(answer.rate, float(rates.min())),
-        region=where,
-        reason=f"one metric at all {len(vertices) + len(checks)} points of the box that were "
-        "looked at, while the trajectories stay in it",
-        evidence="points",
-    )
-    return ball_in_box(answer, loop, np.arange(2 * n)[keep], low, high, h)
+            self.points = np.concatenate([self.points, tried[worst]])
+            self.jacobians = np.concatenate([self.jacobians, checks[worst]])
+        return answer, rates, tried, checks
+
+    def smaller(self) -> str:
+        """Whether the points in the middle of the box alone have a metric, as a clause."""
+        away = np.abs(self.points - (self.low + self.high) / 2) / (self.high - self.low)
+        for part in (2, 4, 8):
+            inside = (away <= 0.5 / part).all(axis=1)
+            if not inside.any():
+                break
+            if search_metric(self.jacobians[inside], discrete=self.h is not None)[0] is not None:
+                return f"; at its {inside.sum()} points within 1/{part} of the box one metric fits"
+        return ""
 
 
 def _integrates(loop: Loop, low: Array, high: Array) -> bool:
@@ -221,3 +201,7 @@ def _integrates(loop: Loop, low: Array, high: Array) -> bool:
     other = s.copy()
     other[:, loop.n :] *= -0.37
     return bool((loop.field(0.0, s) != loop.field(0.0, other)).any())
+
+
+def _text(vector: Array) -> str:
+    return "[" + ", ".join(f"{x:.3g}" for x in vector) + "]"

@@ -10,13 +10,19 @@ condition number (Boyd, El Ghaoui, Feron, Balakrishnan, Linear Matrix Inequaliti
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import matrix_balance, solve_continuous_lyapunov, solve_discrete_lyapunov
+from numpy.typing import ArrayLike
+from scipy.linalg import (
+    cho_factor,
+    cho_solve,
+    matrix_balance,
+    solve_continuous_lyapunov,
+    solve_discrete_lyapunov,
+)
 
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array, checked
+from cmc.theory.contraction import metric_factor
 
 _CONDITION = 1e6
 # A metric worse than this is left as it is: what could be gained is lost in rounding.
@@ -24,48 +30,25 @@ _HOPELESS = 1e14
 _GAP = 1e-7
 
 
-@dataclass(frozen=True)
-class MetricSearch:
-    """Outcome of a search.
-
-    Attributes:
-        metric: M, symmetric positive definite, smallest eigenvalue 1, (m, m); None if there is
-            none.
-        worst: Index of the vertex that resists most.
-    """
-
-    metric: Array | None
-    worst: int
-
-
-def search_metric(vertices: ArrayLike, *, discrete: bool = False) -> MetricSearch:
+def search_metric(vertices: ArrayLike, *, discrete: bool = False) -> tuple[Array | None, int]:
     """Find M > 0 with J^T M + M J < 0 for every vertex, or A^T M A < M with `discrete`.
 
-    Args:
-        vertices: Matrices, (V, m, m).
-        discrete: Whether the vertices are steps of a sampled loop.
-
-    Raises:
-        ValueError: if the vertices have a wrong shape or are not finite.
+    Returns:
+        M (m, m) with a smallest eigenvalue of 1, or None if there is none, and the index of the
+        vertex (V, m, m) that resists most.
     """
-    J = np.asarray(vertices, dtype=float)
-    if J.ndim != 3 or not len(J) or J.shape[1] != J.shape[2]:
-        raise ValueError(f"vertices needs shape (V, m, m) with V >= 1, got {J.shape}")
-    if not np.isfinite(J).all():
-        raise ValueError("vertices needs finite entries")
+    J = checked("vertices", vertices, "V m m")
     growth = _growth(J, discrete)
     worst = int(np.argmax(growth))
     if growth[worst] >= 0 or _growth(J.mean(axis=0), discrete) >= 0:
         # a common metric would make every convex combination decay, the mean among them
-        return MetricSearch(None, worst)
+        return None, worst
     try:
         theta = _mean_metric_factor(J.mean(axis=0), discrete)
-        metric, worst = _feasible(_operators(theta @ J @ np.linalg.inv(theta), discrete))
+        metric, worst = _feasible(theta @ J @ np.linalg.inv(theta), discrete)
     except np.linalg.LinAlgError:  # further apart in size than floats can tell
-        return MetricSearch(None, worst)
-    if metric is None:
-        return MetricSearch(None, worst)
-    return MetricSearch(_scaled(theta.T @ metric @ theta), worst)
+        return None, worst
+    return None if metric is None else _scaled(theta.T @ metric @ theta), worst
 
 
 def condition_metric(vertices: ArrayLike, metric: ArrayLike, *, discrete: bool = False) -> Array:
@@ -82,25 +65,23 @@ def condition_metric(vertices: ArrayLike, metric: ArrayLike, *, discrete: bool =
     Raises:
         ValueError: if the given metric is not a common metric of the vertices.
     """
-    J, start = np.asarray(vertices, dtype=float), _scaled(np.asarray(metric, dtype=float))
+    J = checked("vertices", vertices, "V m m")
+    metric_factor(metric)
+    start = _scaled(checked("metric", metric, "m m", m=J.shape[-1]))
     if np.linalg.cond(start) > _HOPELESS:
         return start
     theta = np.linalg.cholesky(start).T
-    operators = _operators(theta @ J @ np.linalg.inv(theta), discrete)
-    m, d = start.shape[0], operators.shape[1]
-    E, inverse = _basis(m), np.linalg.inv(theta)
-    unit = inverse.T @ inverse  # the identity of the original coordinates, seen from the local ones
-    x = np.append(1.01 * np.einsum("dii->d", E), 1.1 * 1.01 * np.linalg.cond(start))
-    if np.linalg.eigvalsh(np.einsum("vdij,d->vij", operators, x[:d])).max() >= 0:
+    inverse = np.linalg.inv(theta)
+    # the identity of the original coordinates, seen from the local ones, is the floor of P
+    barrier = _Barrier(theta @ J @ inverse, discrete, inverse.T @ inverse, free=False)
+    x = np.append(1.01 * barrier.pack(np.eye(len(start))), 1.1 * 1.01 * np.linalg.cond(start))
+    if barrier.growth(x).max() >= 0:
         raise ValueError("the metric to start from is not a common metric of the vertices")
-    A, C = np.zeros((len(J) + 2, d + 1, m, m)), np.zeros((len(J) + 2, m, m))
-    A[:-2, :d], A[-2, :d], A[-1, :d] = -operators, E, -E
-    A[-1, d], C[-2] = unit, -unit
-    weight = 1 / x[d]
+    weight = 1 / x[-1]
     while True:
-        x = _center(A, C, weight * np.eye(d + 1)[d], x)
-        if A.shape[0] * m / weight < 0.02 * x[d]:
-            return _scaled(theta.T @ np.tensordot(x[:d], E, 1) @ theta)
+        x = barrier.center(weight, x)
+        if (len(J) + 2) * len(start) / weight < 0.02 * x[-1]:
+            return _scaled(theta.T @ barrier.matrix(x) @ theta)
         weight *= 8.0
 
 
@@ -108,7 +89,7 @@ def _scaled(metric: Array) -> Array:
     """The symmetric part, with a smallest eigenvalue of 1."""
     metric = (metric + metric.T) / 2
     smallest = np.linalg.eigvalsh(metric)[0]
-    return metric / (smallest if smallest > 0 else np.diag(metric).min())
+    return metric / (smallest if smallest > 0 else np.diag(metric).min())  # 0 but for rounding
 
 
 def _growth(J: Array, discrete: bool) -> Array:
@@ -136,80 +117,151 @@ def _mean_metric_factor(J: Array, discrete: bool) -> Array:
     return np.linalg.cholesky(metric).T * units
 
 
-def _basis(m: int) -> Array:
-    """Basis of the symmetric m x m matrices, (m (m + 1) / 2, m, m)."""
-    i, j = np.triu_indices(m)
-    basis = np.zeros((len(i), m, m))
-    basis[np.arange(len(i)), i, j] = 1.0
-    basis[np.arange(len(i)), j, i] = 1.0
-    return basis
-
-
-def _operators(J: Array, discrete: bool) -> Array:
-    """Left-hand sides of the inequality for every basis matrix, scaled to 1, (V, d, m, m)."""
-    E = _basis(J.shape[-1])[None]
-    J = J[:, None]
-    Jt = np.swapaxes(J, -1, -2)
-    operators = Jt @ E @ J - E if discrete else Jt @ E + E @ J
-    # every inequality may be scaled by its own positive factor
-    return operators / np.sqrt((operators**2).sum(axis=(1, 2, 3), keepdims=True))
-
-
-def _feasible(operators: Array) -> tuple[Array | None, int]:
-    """Minimise t subject to operator_v(P) <= t I and I <= P <= condition I; stop at its sign."""
-    d, m = operators.shape[1], operators.shape[-1]
-    E, eye = _basis(m), np.eye(m)
-    A, C = np.zeros((len(operators) + 2, d + 1, m, m)), np.zeros((len(operators) + 2, m, m))
-    A[:-2, :d], A[-2, :d], A[-1, :d] = -operators, E, -E
-    A[:-2, d], C[-2], C[-1] = eye, -eye, _CONDITION * eye
-    x = np.append(2.0 * np.einsum("dii->d", E), 0.0)  # P = 2 I
-
-    def residuals(x: Array) -> Array:
-        return np.linalg.eigvalsh(np.einsum("vdij,d->vij", operators, x[:d]))[:, -1]
-
-    x[d] = residuals(x).max() + 0.1
+def _feasible(J: Array, discrete: bool) -> tuple[Array | None, int]:
+    """Minimise t subject to growth_v(P) <= t I and I <= P <= condition I; stop at its sign."""
+    m = J.shape[-1]
+    barrier = _Barrier(J, discrete, np.eye(m), free=True)
+    x = np.append(2.0 * barrier.pack(np.eye(m)), 0.0)  # P = 2 I
+    x[-1] = barrier.growth(x).max() + 0.1
     weight = 1.0
     while True:
-        x = _center(A, C, weight * np.eye(d + 1)[d], x, until=lambda x: residuals(x).max() < -_GAP)
-        growth = residuals(x)
+        x = barrier.center(weight, x, until=lambda x: barrier.growth(x).max() < -_GAP)
+        growth = barrier.growth(x)
         worst = int(np.argmax(growth))
         if growth[worst] < -_GAP:
-            return np.tensordot(x[:d], E, 1), worst
-        if x[d] - len(A) * m / weight > -_GAP:  # a lower bound on the best t: no metric
+            return barrier.matrix(x), worst
+        if x[-1] - (len(J) + 2) * m / weight > -_GAP:  # a lower bound on the best t: no metric
             return None, worst
         weight *= 8.0
 
 
-def _center(
-    A: Array, C: Array, cost: Array, x: Array, until: Callable[[Array], bool] = lambda x: False
-) -> Array:
-    """Newton's method on cost . x - sum log det(C_k + sum_d x_d A_kd), from a point inside."""
-    here = _value(A, C, cost, x)
-    for _ in range(60):
-        if until(x):
-            break
-        W = np.linalg.inv(C + np.einsum("kdij,d->kij", A, x))[:, None] @ A
-        gradient = cost - np.einsum("kdii->d", W)
-        flat = W.transpose(1, 0, 2, 3).reshape(W.shape[1], -1)
-        hessian = flat @ W.transpose(1, 0, 3, 2).reshape(W.shape[1], -1).T
-        scale = 1 / np.sqrt(np.diag(hessian))
-        scaled = hessian * scale * scale[:, None]
-        move = -scale * np.linalg.lstsq(scaled, scale * gradient, rcond=None)[0]
-        decrement, length = float(-gradient @ move), 1.0
-        if decrement < 1e-3:
-            break
-        while (ahead := _value(A, C, cost, x + length * move)) > here - 0.1 * length * decrement:
-            length /= 2
-            if length < 1e-10:
-                return x
-        x, here = x + length * move, ahead
-    return x
+class _Barrier:
+    """weight s - log det of all that has to stay positive definite, in x = (P, s).
+
+    These are B < P at the bottom, and growth_v(P) = D^T P K + K^T P D at each vertex: J^T P + P J
+    with D = J, K = I, and A^T P A - P with D = A - I, K = I + D/2. With `free` growth_v < s I and
+    P < condition B, otherwise growth_v < 0 and P < s B.
+    """
+
+    def __init__(self, J: Array, discrete: bool, bottom: Array, *, free: bool) -> None:
+        self.m, self.bottom, self.free = len(bottom), bottom, free
+        self.eye, self.at = np.eye(self.m), np.triu_indices(self.m)
+        self.index = np.empty((self.m, self.m), dtype=int)  # where x holds each entry of P
+        self.index[self.at] = self.index.T[self.at] = np.arange(len(self.at[0]))
+        basis = (self.index == np.arange(len(self.at[0]))[:, None, None]).astype(float)
+        self.basis = basis.reshape(len(basis), -1)
+        D = J - self.eye if discrete else J
+        self.K = self.eye + D / 2 if discrete else np.broadcast_to(self.eye, J.shape)
+        self.KT = _transposed(self.K)
+        image = _transposed(D)[:, None] @ basis @ self.K[:, None]
+        size = np.sqrt(np.square(image + _transposed(image)).sum(axis=(1, 2, 3)))
+        self.D = (
+            D / size[:, None, None]
+        )  # every inequality may be scaled by its own positive factor
+        self.DT = _transposed(self.D)
+
+    def pack(self, P: Array) -> Array:
+        """The entries of P that x holds."""
+        return P[self.at]
+
+    def matrix(self, x: Array) -> Array:
+        """P of x, (m, m)."""
+        return np.asarray(x[self.index])
+
+    def growth(self, x: Array) -> Array:
+        """Largest eigenvalue of each growth_v(P), (V,)."""
+        half = self.DT @ x[self.index] @ self.K
+        return np.asarray(np.linalg.eigvalsh(half + _transposed(half))[:, -1], dtype=float)
+
+    def _positive(self, x: Array) -> Array:
+        """All matrices that have to stay positive definite, (V + 2, m, m)."""
+        P, s = x[self.index], x[-1]
+        half = self.DT @ P @ self.K
+        found = np.empty((len(half) + 2, self.m, self.m))
+        found[:-2] = (s if self.free else 0.0) * self.eye - half - _transposed(half)
+        found[-2] = P - self.bottom
+        found[-1] = (_CONDITION if self.free else s) * self.bottom - P
+        return found
+
+    def value(self, weight: float, x: Array) -> float:
+        """The barrier function; infinity outside the constraints."""
+        try:
+            factors = np.linalg.cholesky(self._positive(x))
+        except np.linalg.LinAlgError:
+            return np.inf
+        return float(weight * x[-1]) - 2 * float(np.log(np.einsum("kii->ki", factors)).sum())
+
+    def derivatives(self, weight: float, x: Array) -> tuple[Array, Array]:
+        """Gradient and Hessian at x: -tr(W dS), and tr(W dS W dS) with W = S^-1."""
+        W = np.linalg.inv(self._positive(x))
+        inner, low, top = W[:-2], W[-2], W[-1]
+        N = self.D @ inner @ self.KT
+        slope = 2 * N.sum(axis=0) - low + top
+        if self.free:
+            square = inner @ inner
+            mixed = -2 * (self.D @ square @ self.KT).sum(axis=0)
+            first, second = np.einsum("vii->", inner), np.einsum("vii->", square)
+        else:
+            turned = top @ self.bottom
+            mixed, first, second = -turned @ top, np.trace(turned), np.trace(turned @ turned)
+        # sum of tr(X P Y R) over pairs (P, R), in the entries of X and of Y
+        P = np.concatenate([2 * N, 2 * self.K @ inner @ self.KT, W[-2:]])
+        R = np.concatenate([N, self.D @ inner @ self.DT, W[-2:]])
+        m, d = self.m, len(x) - 1
+        curved = (P.reshape(-1, m * m).T @ R.reshape(-1, m * m)).reshape(m, m, m, m)
+        hessian = np.empty((d + 1, d + 1))
+        hessian[:d, :d] = (
+            self.basis @ curved.transpose(3, 0, 1, 2).reshape(m * m, -1) @ self.basis.T
+        )
+        hessian[:d, d] = hessian[d, :d] = self.basis @ mixed.ravel()
+        hessian[d, d] = second
+        return np.append(self.basis @ slope.ravel(), weight - first), hessian
+
+    def squares(self, x: Array) -> Array:
+        """The Hessian as a sum of squares: slower, and positive semidefinite whatever rounds."""
+        root = np.linalg.inv(np.linalg.cholesky(self._positive(x)))[:, None]
+        basis = self.basis.reshape(-1, self.m, self.m)
+        image = self.DT[:, None] @ basis @ self.K[:, None]
+        moved = np.zeros((len(root), len(x), self.m, self.m))
+        moved[:-2, :-1], moved[-2, :-1] = -image - _transposed(image), basis
+        moved[-1, :-1] = -basis
+        if self.free:
+            moved[:-2, -1] = self.eye
+        else:
+            moved[-1, -1] = self.bottom
+        flat = (root @ moved @ _transposed(root)).transpose(1, 0, 2, 3).reshape(len(x), -1)
+        return np.asarray(flat @ flat.T)
+
+    def center(
+        self, weight: float, x: Array, until: Callable[[Array], bool] = lambda x: False
+    ) -> Array:
+        """Newton's method from a point inside."""
+        here = self.value(weight, x)
+        for _ in range(60):
+            if until(x):
+                break
+            gradient, hessian = self.derivatives(weight, x)
+            try:
+                scale = 1 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+                scaled = cho_factor(hessian * scale * scale[:, None])
+                move = -scale * cho_solve(scaled, scale * gradient)
+            except np.linalg.LinAlgError:  # not positive definite to rounding
+                hessian = self.squares(x)
+                scale = 1 / np.sqrt(np.diag(hessian))
+                scaled = hessian * scale * scale[:, None]
+                move = -scale * np.linalg.lstsq(scaled, scale * gradient, rcond=None)[0]
+            decrement, length = float(-gradient @ move), 1.0
+            if decrement < 1e-3:
+                break
+            while (
+                ahead := self.value(weight, x + length * move)
+            ) > here - 0.1 * length * decrement:
+                length /= 2
+                if length < 1e-10:
+                    return x
+            x, here = x + length * move, ahead
+        return x
 
 
-def _value(A: Array, C: Array, cost: Array, x: Array) -> float:
-    """The barrier function; infinity outside the constraints."""
-    try:
-        factors = np.linalg.cholesky(C + np.einsum("kdij,d->kij", A, x))
-    except np.linalg.LinAlgError:
-        return np.inf
-    return float(cost @ x) - 2 * float(np.log(np.einsum("kii->ki", factors)).sum())
+def _transposed(matrices: Array) -> Array:
+    return np.swapaxes(matrices, -1, -2)

@@ -11,7 +11,7 @@ with phi = e^{-h/tau}, G = K (1 - phi). Jury's conditions on this 2x2 matrix are
 
 Another quadrature of the integral has another bound: forward Euler or the trapezoid rule decide
 more than a third of random samples differently. The bound is exact for constant slopes; slopes that
-vary need a common metric (`certificates.common_metric` with `discrete=True`).
+vary need a common metric (`certificates.common_metric` with `h`).
 """
 
 from __future__ import annotations
@@ -23,42 +23,24 @@ from scipy.linalg import expm
 from cmc.theory.arrays import Array, checked, number
 
 
-def _positive(name: str, value: ArrayLike) -> Array:
-    array = np.asarray(value, dtype=float)
-    if not np.isfinite(array).all() or (array <= 0).any():
-        raise ValueError(f"{name} needs positive finite values, got {array}")
-    return array
-
-
 def hold_lag(Lambda: ArrayLike, R: ArrayLike, h: float) -> tuple[Array, Array]:
-    """Exact step of z' = Lambda z + R a under a held a: z_{k+1} = phi z_k + G a_k.
+    """Exact step of z' = Lambda z + R a under a held a: z_{k+1} = phi z_k + G a_k, (...,) each.
 
-    phi = e^{Lambda h}, G = R (e^{Lambda h} - 1) / Lambda, and R h where Lambda is 0.
-
-    Args:
-        Lambda: Open-loop rates, any sign, 1/s, (...,).
-        R: Gains, (...,).
-        h: Sample time, s.
-
-    Returns:
-        phi and G, (...,).
+    phi = e^{Lambda h}, G = R (e^{Lambda h} - 1) / Lambda, and R h where Lambda is 0; Lambda (...,)
+    of any sign in 1/s, R (...,), h in s.
     """
-    h = float(_positive("h", h))
-    Lambda, R = np.asarray(Lambda, dtype=float), np.asarray(R, dtype=float)
+    h, Lambda, R = number("h", h, above=0.0), checked("Lambda", Lambda), checked("R", R)
     flat = np.abs(Lambda * h) < 1e-12
+    if (Lambda * h > 700).any():
+        raise ValueError(f"Lambda h needs to be below 700, e^700 is the largest float; got h = {h}")
     growth = np.expm1(Lambda * h) / np.where(flat, 1.0, Lambda)
     return np.exp(Lambda * h), R * np.where(flat, h, growth)
 
 
 def hold(Lambda: ArrayLike, R: ArrayLike, h: float) -> tuple[Array, Array]:
-    """Exact step of z' = Lambda z + R a under a held a, for full matrices: z + = Phi z + Gamma a.
+    """Exact step for matrices Lambda (n, n) in 1/s and R (n, m): z_{k+1} = Phi z_k + Gamma a_k.
 
     Phi = e^{Lambda h} and Gamma = int_0^h e^{Lambda s} ds R, both blocks of one exponential.
-
-    Args:
-        Lambda: (n, n), 1/s.
-        R: (n, m).
-        h: Sample time, s.
     """
     Lambda = checked("Lambda", Lambda, "n n")
     R = checked("R", R, "n m", n=len(Lambda))
@@ -66,7 +48,12 @@ def hold(Lambda: ArrayLike, R: ArrayLike, h: float) -> tuple[Array, Array]:
     size = max(float(np.abs(R).max()), 1e-300)  # an exponential knows no units
     block = np.zeros((n + m, n + m))
     block[:n, :n], block[:n, n:] = Lambda * h, R / size
-    step = expm(block)
+    if np.abs(block).max() < 1e150:
+        step = expm(block)
+    if np.abs(block).max() >= 1e150 or not np.isfinite(step).all():
+        raise ValueError(
+            f"Lambda h is too large for e^(Lambda h); got {np.abs(Lambda * h).max():g}"
+        )
     return step[:n, :n], step[:n, n:] * size * h
 
 
@@ -83,12 +70,17 @@ def sampled_matrix(
         h: Sample time, s.
     """
     phi, G = hold_lag(Lambda, R, h)
-    k1, k2 = np.asarray(k1, dtype=float), np.asarray(k2, dtype=float)
-    phi, G, k1, k2 = np.broadcast_arrays(phi, G, k1, k2)
+    phi, G, k1, k2 = np.broadcast_arrays(phi, G, checked("k1", k1), checked("k2", k2))
     step = np.empty((*phi.shape, 2, 2))
     step[..., 0, 0], step[..., 0, 1] = phi - G * (k1 + h * k2), -G * k2
     step[..., 1, 0], step[..., 1, 1] = h, 1.0
     return step
+
+
+def _top(tau: ArrayLike, K: ArrayLike, h: ArrayLike) -> tuple[Array, Array, Array]:
+    """coth(h / (2 tau)) / K, and K and h as arrays, all positive."""
+    tau, K, h = (checked(*x, above=0.0) for x in (("tau", tau), ("K", K), ("h", h)))
+    return 1 / (np.tanh(h / (2 * tau)) * K), K, h
 
 
 def sampled_margin(
@@ -97,24 +89,13 @@ def sampled_margin(
     """Distance to the edge of stability of a sampled lag, (...,): positive means stable.
 
     The smallest of the three slacks, each relative to the range coth(h/(2 tau))/K + 1/K of k1 (the
-    one in k2 times h/2): 0 at the edge, and of order 1 in the middle.
-
-    Args:
-        k1: Slope in the error, (...,).
-        k2: Slope in the integral, 1/s, (...,).
-        tau: Time constant, s, (...,).
-        K: Static gain, positive, (...,).
-        h: Sample time, s, (...,).
-
-    Raises:
-        ValueError: if tau, K or h is not positive.
+    one in k2 times h/2): 0 at the edge, and of order 1 in the middle. Slopes k1 and k2 (1/s), time
+    constant tau (s), static gain K and sample time h (s), (...,) each.
     """
-    tau, K, h = _positive("tau", tau), _positive("K", K), _positive("h", h)
-    k1, k2 = np.asarray(k1, dtype=float), np.asarray(k2, dtype=float)
-    top = 1 / (np.tanh(h / (2 * tau)) * K)
+    top, K, h = _top(tau, K, h)
+    k1, k2 = checked("k1", k1), checked("k2", k2)
     slack = np.broadcast_arrays(h / 2 * k2, k1 + 1 / K, top - k1 - h / 2 * k2)
-    worst: Array = np.min(slack, axis=0) / (top + 1 / K)
-    return worst
+    return np.asarray(np.min(slack, axis=0) / (top + 1 / K))
 
 
 def largest_slope(
@@ -142,13 +123,10 @@ def largest_slope(
     """
     if ratio is not None and k2 is not None:
         raise ValueError("give ratio or k2, not both")
-    tau, K, h = _positive("tau", tau), _positive("K", K), _positive("h", h)
-    top = 1 / (np.tanh(h / (2 * tau)) * K)
-    other = np.asarray(0.0 if ratio is None else ratio, dtype=float)
-    fixed = np.asarray(0.0 if k2 is None else k2, dtype=float)
-    if (other < 0).any() or (fixed < 0).any():
-        raise ValueError("ratio and k2 need to be 0 or more")
-    limit: Array = (top - h / 2 * fixed) / (1 + h / 2 * other)
+    top, K, h = _top(tau, K, h)
+    other = checked("ratio", 0.0 if ratio is None else ratio, least=0.0)
+    fixed = checked("k2", 0.0 if k2 is None else k2, least=0.0)
+    limit = np.asarray((top - h / 2 * fixed) / (1 + h / 2 * other))
     if (limit <= 0).any():
         raise ValueError(
             f"k2 leaves no room for k1: (h/2) k2 reaches coth(h/(2 tau))/K = {np.min(top):.4g}"

@@ -1,9 +1,10 @@
-"""Simulate a plant under a policy: continuous or with a held command, many starts in one call.
+"""Solve differential equations, and simulate a plant under a policy, many starts in one call.
 
     z = T_y (y - y_ref),   I' = z,   a = pi(z, I),   u = u0 + T_a a,   y' = f(y, u, t)
 
-The step size is chosen for the whole batch at once, so that trajectories stay comparable sample by
-sample. `cmc.theory.exact` differentiates the same loop, and so cannot speak of another one.
+The command acts at once or is held. The step size is chosen for the whole batch, so that
+trajectories stay comparable sample by sample. `cmc.theory.exact` differentiates the same loop, and
+so cannot speak of another one. Wrong shapes, numbers and times raise ValueError, or TypeError.
 """
 
 from __future__ import annotations
@@ -16,36 +17,104 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from cmc.theory.action import action_of, inner
-from cmc.theory.arrays import Array, checked, number
-from cmc.theory.auxiliary import AuxiliarySpace, decompose
-from cmc.theory.flow import flow, linear_flow, rk4
+from cmc.theory.arrays import (
+    Array,
+    checked,
+    increasing,
+    not_overflown,
+    number,
+    refuse_uncallable,
+    together,
+)
+from cmc.theory.auxiliary import AuxiliarySpace, applied, decompose
+from cmc.theory.slopes import action_of, inner
 from cmc.theory.tracking import aligned
 
-__all__ = [
-    "Loop",
-    "Path",
-    "closed_loop",
-    "equilibrium",
-    "flow",
-    "linear_flow",
-    "rk4",
-    "transforms_of",
-]
-
 Transforms = Callable[[Array], AuxiliarySpace]
+
+_MOST_STEPS = 100_000
+# Dormand and Prince 1980: y + h sum b_i k_i of order 5; _E is its difference to order 4.
+_A = (
+    (1 / 5,),
+    (3 / 40, 9 / 40),
+    (44 / 45, -56 / 15, 32 / 9),
+    (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
+    (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
+    (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
+)
+_C = (0.2, 0.3, 0.8, 8 / 9, 1.0, 1.0)
+_E = (71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40)
+
+
+def flow(
+    rhs: Callable[[float, Array], Array], start: ArrayLike, t: ArrayLike, *, tol: float = 1e-8
+) -> Array:
+    """Solve s' = rhs(t, s) by Dormand and Prince's adaptive method, one step size for the batch.
+
+    From the states `start`, (..., n), at t[0] to those at the increasing times t [s], (time,):
+    (time, ..., n). `tol` is the largest error of a step, relative to the largest size of that
+    signal so far. States that explode or need more than 100,000 steps are a ValueError.
+    """
+    times, s = increasing("t", t), checked("start", start, "... n").copy()
+    tol = number("tol", tol, above=0.0)
+    refuse_uncallable("rhs", rhs)
+    path = np.empty((len(times), *s.shape))
+    path[0], now, steps = s, float(times[0]), 0
+    first = checked("rhs(t, start)", rhs(now, s))
+    if first.shape != s.shape:
+        raise ValueError(f"rhs(t, start) needs shape {s.shape}, got {first.shape}")
+    batch = tuple(range(s.ndim - 1))
+    largest = np.abs(s).max(axis=batch, initial=0.0)
+    speed = np.abs(first).max(axis=batch, initial=0.0)
+    # a first step that moves nothing by more than a hundredth of the whole state
+    step = float(times[1] - times[0])
+    step = min(step, 0.01 * float(largest.max() / max(speed.max(), 1e-300)) or step)
+    for i, end in enumerate(times[1:], 1):
+        while now < end:
+            h, k = min(step, end - now), [first]
+            with np.errstate(over="ignore", invalid="ignore"):
+                for row, c in zip(_A, _C, strict=True):
+                    new = s + h * sum(a * d for a, d in zip(row, k, strict=True) if a)
+                    k.append(rhs(now + c * h, new))
+                error = h * sum(e * d for e, d in zip(_E, k, strict=True) if e)
+                size = np.maximum(largest, np.abs(new).max(axis=batch, initial=0.0))
+                size = np.maximum(size, 1e-6 * size.max()) + 1e-300
+                worst = float(np.max(np.abs(error) / (tol * size), initial=0.0))
+            if worst <= 1.0:
+                now = float(end) if h == end - now else now + h
+                s, first, largest = new, k[-1], size
+            elif h < 1e-13 * max(abs(now), end - times[0]):
+                steps = _MOST_STEPS
+            steps += 1
+            if steps > _MOST_STEPS:
+                raise ValueError(f"the states explode or are too stiff to follow at t = {now:.6g}")
+            if h == step or not worst <= 1.0:  # not where the interval's end cut the step short
+                step = h * float(np.clip(0.9 * max(worst, 1e-9) ** -0.2, 0.1, 5.0))
+                step = step if np.isfinite(worst) else 0.1 * h
+        path[i] = s
+    return path
+
+
+def linear_flow(A: ArrayLike, t: ArrayLike, start: ArrayLike | None = None) -> Array:
+    """Solve x' = A x exactly: x(t) = e^(A (t - t_0)) x(t_0), (time, ..., n).
+
+    A is (n, n) in 1/s, t (time,) in s, `start` (..., n) at t[0]; without it the maps themselves are
+    returned, (time, n, n).
+    """
+    A, times = checked("A", A, "n n"), checked("t", t, "time")
+    x = None if start is None else checked("start", start, "... n", n=len(A))
+    with np.errstate(over="ignore", invalid="ignore"):
+        maps = expm(A * (times - times[0])[:, None, None])
+        found = np.asarray(maps if x is None else np.einsum("tij,...j->t...i", maps, x))
+    not_overflown("A and t", found)
+    return found
 
 
 @dataclass(frozen=True)
 class Path:
-    """Trajectories of a loop, (time, ..., n) each.
+    """Trajectories of a loop, (time, ..., n) each, at the times t [s], (time,).
 
-    Attributes:
-        t: Times, s, (time,).
-        y: Latent signal.
-        z: Auxiliary signal T_y (y - y_ref).
-        integral: int z dt.
-        u: Command that acts from each time on.
+    z = T_y (y - y_ref), integral = int z dt; u is the command that acts from each time on.
     """
 
     t: Array
@@ -58,12 +127,10 @@ class Path:
 def equilibrium(plant: Any, y: ArrayLike, t: float = 0.0) -> Array:
     """Command that holds a plant still at `y`: the root u of f(y, u, t) = 0, (..., n).
 
-    Newton's method with halved steps, from u = 0; one step where f is affine in u.
-
-    Raises:
-        ValueError: If some `y` cannot be held: f_u is singular, or no root is found.
+    Newton's method with halved steps, from u = 0; one step where f is affine in u. A `y` that
+    cannot be held (f_u is singular, no root is found) is a ValueError.
     """
-    y = checked("y", y, "... n", n=plant.n)
+    y, t = checked("y", y, "... n", n=plant.n), number("t", t)
     u = np.zeros_like(y)
     f = np.asarray(plant.f(y, u, t), dtype=float)
     scale = size = np.linalg.norm(f, axis=-1)
@@ -74,9 +141,10 @@ def equilibrium(plant: Any, y: ArrayLike, t: float = 0.0) -> Array:
         except np.linalg.LinAlgError:
             raise ValueError(f"{plant!r} cannot be held still: f_u is singular") from None
         length = np.ones_like(size)
+        met = size <= 1e-13 * (scale + np.linalg.norm(f_u @ u[..., None], axis=(-2, -1)))
         for _ in range(30):
             ahead = np.asarray(plant.f(y, u + length[..., None] * move, t), dtype=float)
-            worse = ~(np.linalg.norm(ahead, axis=-1) < size) & (size > 0)
+            worse = ~(np.linalg.norm(ahead, axis=-1) < size) & ~met
             if not worse.any():
                 break
             length = np.where(worse, length / 2, length)
@@ -84,7 +152,7 @@ def equilibrium(plant: Any, y: ArrayLike, t: float = 0.0) -> Array:
         u = u + step
         f = np.asarray(plant.f(y, u, t), dtype=float)
         size = np.linalg.norm(f, axis=-1)
-        if (np.abs(step) <= 1e-14 * np.abs(u)).all():
+        if met.all() or (np.abs(step) <= 1e-14 * np.abs(u)).all():
             break
     rounding = 1e-13 * np.linalg.norm(f_u, axis=(-2, -1)) * np.linalg.norm(u, axis=-1)
     bad = ~(size <= 1e-9 * scale + rounding)
@@ -106,22 +174,26 @@ def transforms_of(
     """
     if callable(transforms):
         return transforms
+    if transforms is not None and not isinstance(transforms, AuxiliarySpace):
+        raise TypeError(f"transforms needs an AuxiliarySpace or a function, got {transforms!r}")
 
     def jacobians(y: Array) -> tuple[Array, Array]:
         u = np.zeros(plant.n) if plant.constant else equilibrium(plant, y)
         return plant.f_y(y, u), plant.f_u(y, u)
 
-    if transforms is not None:
-        T_y, T_a = transforms.T_y, transforms.T_a
-        at = np.zeros(plant.n)
-        space = AuxiliarySpace.from_transforms(T_y, T_a, *jacobians(at)) if plant.constant else None
-        return lambda y: space or AuxiliarySpace.from_transforms(T_y, T_a, *jacobians(y))
+    def build(y: Array) -> AuxiliarySpace:
+        if transforms is None:
+            return decompose(*jacobians(y))
+        return AuxiliarySpace.from_transforms(transforms.T_y, transforms.T_a, *jacobians(y))
+
     if plant.constant:
-        found = decompose(*jacobians(np.zeros(plant.n)))
+        found = build(np.zeros(plant.n))
         return lambda y: found
+    if transforms is not None:
+        return build
     if centre is None:
         centre = (np.asarray(plant.y_low) + np.asarray(plant.y_high)) / 2
-    first = decompose(*jacobians(np.asarray(centre, dtype=float)))
+    first = build(np.asarray(centre, dtype=float))
     return lambda y: aligned(*jacobians(y), first)
 
 
@@ -143,7 +215,7 @@ def closed_loop(
     Args:
         plant: Has `n`, `f`, `f_y`, `f_u`, `constant`.
         policy: Signed slopes (n, 2), a function from s (..., n, 2) to a, or any policy with
-            the sign rule: see `cmc.theory.action`.
+            the sign rule: see `cmc.theory.slopes.action_of`.
         y0: Starts, (..., n); a network with seeds needs their axis in front.
         t: Increasing times, s, (time,).
         transforms: The auxiliary space, fixed or as a function of y; by default `decompose`, at
@@ -154,16 +226,27 @@ def closed_loop(
         u0: Command to which T_a a (and the policy's own `u0`) is added.
         clip: Whether the plant's limits `u_low`, `u_high` act.
     """
-    loop = Loop(plant, policy, transforms, y_ref, u0, clip)
+    loop, times = Loop(plant, policy, transforms, y_ref, u0, clip), increasing("t", t, 1)
     y = checked("y0", y0, "... n", n=plant.n)
-    I, times = np.broadcast_to(checked("integral", integral), y.shape), checked("t", t, "time")
+    y, I, *_ = together(
+        y0=y, integral=_vector("integral", integral, plant.n), u0=loop.u0, y_ref=loop.y_ref
+    )
     start = np.concatenate([y, I], axis=-1)
     if h is None:
         s = flow(loop.field, start, times)
         rows = [loop.signals(*_halves(x), float(now)) for x, now in zip(s, times, strict=True)]
         z, u = (np.stack(part) for part in zip(*rows, strict=True))
         return Path(times, _halves(s)[0], z, _halves(s)[1], u)
-    return _held(loop, start, times, number("h", h, above=0.0))
+    h = number("h", h, above=0.0)
+    if times[-1] - times[0] > 1e6 * h:
+        raise ValueError(f"h = {h:g} s needs more than 1,000,000 samples up to t = {times[-1]:g} s")
+    return _held(loop, start, times, h)
+
+
+def _vector(name: str, value: ArrayLike, n: int) -> Array:
+    """A number or an array (..., n)."""
+    array = checked(name, value)
+    return checked(name, array, "... n", n=n) if array.ndim else array
 
 
 def _halves(s: Array) -> tuple[Array, Array]:
@@ -186,6 +269,8 @@ def _held(loop: Loop, start: Array, times: Array, h: float) -> Path:
                 break
             until = float(min(times[0] + k * h, end))
             y, now = loop.hold(y, u, now, until), until
+            if not np.isfinite(y).all():
+                raise ValueError(f"the states explode at t = {now:.6g}")
         ys[i], zs[i], Is[i], us[i] = y, loop.signals(y, I, now)[0], I, u
     return Path(times, ys, zs, Is, us)
 
@@ -206,10 +291,10 @@ class Loop:
         policy = inner(policy)
         self.action = action_of(policy, plant.n)
         own = np.asarray(getattr(policy, "u0", 0.0), dtype=float)
-        self.u0 = checked("u0", u0) + own
+        self.u0 = _vector("u0", u0, self.n) + own
         self.spaces = transforms_of(plant, transforms)
         self.goal = y_ref if callable(y_ref) else None
-        self.y_ref = np.zeros(()) if callable(y_ref) else checked("y_ref", y_ref)
+        self.y_ref = np.zeros(()) if callable(y_ref) else _vector("y_ref", y_ref, self.n)
 
     def signals(
         self, y: Array, I: Array, t: float = 0.0, z: Array | None = None
@@ -217,9 +302,12 @@ class Loop:
         """Auxiliary signal z and command u, (..., n) each."""
         space = self.spaces(y)
         if z is None:
-            goal = self.y_ref if self.goal is None else checked("y_ref", self.goal(t))
-            z = space.to_z(y - goal)
-        u = self.u0 + space.to_u(self.action(np.stack([z, I], axis=-1), space.gains))
+            goal = self.y_ref if self.goal is None else _vector("y_ref", self.goal(t), self.n)
+            z = applied(space.T_y, y - goal)
+        a = self.action(np.stack([z, I], axis=-1), space.gains)
+        if a.shape[-1:] != (self.n,) or a.ndim > z.ndim:
+            raise ValueError(f"policy needs to return shape {z.shape}, got {a.shape}")
+        u = self.u0 + applied(space.T_a, a)
         return z, np.clip(u, self.plant.u_low, self.plant.u_high) if self.clip else u
 
     def field(self, t: float, s: Array) -> Array:

@@ -1,8 +1,9 @@
-"""The loop in (z, int z) block by block, and one metric for a hierarchy of contracting blocks."""
+"""What the theory knows of a policy: its action, its slopes, and the loop as a function of them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import copy
+from collections.abc import Callable, Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -10,16 +11,121 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
 
-from cmc.theory.arrays import Array
+from cmc.theory.arrays import Array, checked
 from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.certificates import Certificate, circle_criterion, common_metric
 from cmc.theory.contraction import metric_factor
 from cmc.theory.sampled import hold
 
-Index = NDArray[np.intp]
 EPS = 2.2e-16
 # Settling for this share of the slowest block's rate keeps the metric well conditioned.
 _SHARE = 0.9
+
+Action = Callable[[Array, Array], Array]
+
+
+def action_of(policy: Any, n: int) -> Action:
+    """A policy as a function from s = (z, int z), (..., n, 2), and diag(R), (..., n), to a.
+
+    Signed slopes (n, 2) and a function of s give a as they are. Everything else (an object with
+    `pi(s)`, a network, `ModularPolicy`, the policy of `cmc.sb3`) obeys a_i = -sign(R_ii) pi_i
+    (`constraint_sign`), with the R that it was told, if it was.
+    """
+    if isinstance(policy, (list, tuple, np.ndarray)):
+        slopes = checked("policy", policy, "... n 2", n=n)
+        return lambda s, gains: (slopes * s).sum(axis=-1)
+    if not callable(policy) and not hasattr(policy, "pi"):
+        raise TypeError(
+            f"{type(policy).__name__} is no policy: it has neither pi(s) nor a network to evaluate"
+        )
+    if not hasattr(policy, "pi") and not hasattr(policy, "parameters"):
+        return lambda s, gains: np.asarray(policy(s), dtype=float)
+    pi = policy.pi if hasattr(policy, "pi") else _in_double(policy)
+    seen = np.array([1.0, 1.0 if getattr(policy, "integral", True) else 0.0])
+    return lambda s, gains: np.asarray(-factor_of(policy, gains) * pi(s * seen))  # constraint_sign
+
+
+def inner(policy: Any) -> Any:
+    """The policy that acts on s: what `cmc.sb3` keeps inside, the thing itself otherwise."""
+    return policy.on_signals() if hasattr(policy, "on_signals") else policy
+
+
+def factor_of(policy: Any, gains: Array) -> Array:
+    """What multiplies -pi: sign(R_ii), or 1/R_ii with `normalise`; R as told, or the plant's."""
+    told = None if "R" in getattr(policy, "layout", {}) else getattr(policy, "R", None)
+    R = gains if told is None else np.asarray(told, dtype=float)
+    return np.asarray(1 / R if getattr(policy, "normalise", False) else np.sign(R))
+
+
+def _in_double(policy: Any) -> Callable[[Array], Array]:
+    """A torch network on numpy arrays, in double precision."""
+    if hasattr(policy, "part"):
+        name = type(policy).__name__
+        raise TypeError(f"{name} sees a part of an observation, not (z, int z): pass a function")
+    network = copy.deepcopy(getattr(policy, "network", policy)).double()
+    like = next(network.parameters())
+    end = np.tanh if getattr(policy, "squash", False) else np.asarray
+    return lambda s: end(network(like.new_tensor(s)).detach().numpy())
+
+
+def slope_interval(policy: Any, gains: Array) -> tuple[Array, Array]:
+    """Smallest and largest signed slopes da_i/ds_ij, (n, 2) each; seeds are covered all at once.
+
+    A policy without bounds is a TypeError; bounds that are no intervals or that its slopes leave,
+    and an a_i that depends on other signals than its own, are a ValueError.
+    """
+    n = gains.shape[-1]
+    if isinstance(policy, (list, tuple, np.ndarray)):
+        slopes = checked("policy", policy, "n 2", n=n)
+        return slopes, slopes
+    if not hasattr(policy, "slope_bounds"):
+        raise TypeError(f"{type(policy).__name__} has no slope_bounds(): nothing bounds its slopes")
+    lower, upper = (np.asarray(bound, dtype=float) for bound in policy.slope_bounds())
+    if lower.shape[-2:] != (n, 2) or upper.shape != lower.shape:
+        raise ValueError(f"slope_bounds() needs two of shape ({n}, 2), got {lower.shape}")
+    if not np.isfinite([lower, upper]).all() or (lower < 0).any() or (lower > upper).any():
+        raise ValueError(f"slope bounds need 0 <= lower <= upper, got {lower} and {upper}")
+    if callable(policy) or hasattr(policy, "pi"):
+        _probe(policy, lower, upper)
+    lower, upper = lower.reshape(-1, n, 2).min(axis=0), upper.reshape(-1, n, 2).max(axis=0)
+    ends = -factor_of(policy, gains)[:, None] * np.stack([lower, upper])
+    return ends.min(axis=0), ends.max(axis=0)
+
+
+def _probe(policy: Any, lower: Array, upper: Array) -> None:
+    """Ask the policy itself, at random signals of many sizes, whether its bounds can be true."""
+    n, one = lower.shape[-2], np.ones(lower.shape[-2])
+    pi, factor = action_of(policy, n), np.zeros(n) + np.abs(factor_of(policy, one))
+    # signals of all sizes, half of them in the units in which each moves the action alike
+    unit = np.ones((*lower.shape[:-2], 64, n, 2))
+    unit[..., ::2, :, :] /= np.where(upper > 0, upper, 1.0)[..., None, :, :]
+    unit *= 10.0 ** np.linspace(-6, 6, 64)[:, None, None]
+    s, step = unit * np.random.default_rng(0).normal(size=unit.shape), 1e-4 * unit
+    here = pi(s, one)
+    ahead = s[..., None, None, :, :] + step[..., None, None] * np.eye(2 * n).reshape(n, 2, n, 2)
+    change = np.abs(pi(ahead, one) - here[..., None, None, :])  # of a_k by s_jm, (..., j, m, k)
+    rounding = 1e-12 * (np.abs(here)[..., None, None, :] + change).max(axis=-1)
+    others = (change * (1 - np.eye(n)[:, None])).max(axis=-1)
+    coupled = others > 1e-9 * change.max(axis=-1) + 10 * rounding
+    if coupled.any():
+        name = type(getattr(policy, "network", policy)).__name__
+        raise ValueError(
+            f"{name} is coupled: signal {np.argwhere(coupled)[0][-2] + 1} also moves other actions "
+            "than its own, so slope_bounds() says too little; a box (`region`) looks at the full "
+            "Jacobian"
+        )
+    own = step * factor[:, None]
+    slope = np.einsum("...jmj->...jm", change) / own  # the sign rule has its own check
+    low, high = lower[..., None, :, :], upper[..., None, :, :]
+    slack = 1e-6 * high + rounding / own
+    wrong = (slope < low - slack) | (slope > high + slack)
+    if wrong.any():
+        j, m = np.argwhere(wrong)[0][-2:]
+        raise ValueError(
+            f"slope_bounds() of {type(policy).__name__} states [{low[..., j, m].min():.4g}, "
+            f"{high[..., j, m].max():.4g}] for signal ({j + 1}, {m + 1}), its slopes reach from "
+            f"{slope[..., j, m].min():.4g} to {slope[..., j, m].max():.4g}"
+        )
 
 
 class BlockLoop:
@@ -76,7 +182,7 @@ class BlockLoop:
         slopes[:, modes] = picked
         return self.matrix(slopes)
 
-    def states(self, block: list[int]) -> Index:
+    def states(self, block: list[int]) -> NDArray[np.intp]:
         """Where the block's z and int z stand in the state."""
         return np.flatnonzero(np.isin(self.keep % self.n, block))
 
@@ -138,12 +244,6 @@ def compose_hierarchical(
         rates: One rate per block, 1/s, positive.
         couplings: For i < j the vertices (V, m_i, m_j) of the block through which j drives i.
         h: Sample time, s, where the blocks are steps.
-
-    Returns:
-        The block-diagonal metric and the rate in 1/s.
-
-    Raises:
-        ValueError: if a rate is not positive or a coupling points the wrong way.
     """
     if not (np.isfinite(rates).all() and min(rates) > 0):
         raise ValueError(f"every block needs a positive rate, got {list(rates)}")
