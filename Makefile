@@ -13,7 +13,7 @@ INSTALL := $(PIP) install --quiet $(PIP_FLAGS) --constraint constraints.txt
 # One thread a process: the checks run $(JOBS) processes side by side.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help course test lint types unit notebooks bench claims site clean browser
+.PHONY: help course test lint types unit notebooks bench claims site browser chromium clean
 
 help:
 	@echo "make course   install what the course needs and open it in JupyterLab"
@@ -22,6 +22,7 @@ help:
 	@echo "make bench    speed, as ratios measured in one run"
 	@echo "make claims   write site/claims.md from the shipped results"
 	@echo "make site     build the static site in build/site, offline"
+	@echo "make browser  every lesson in JupyterLab, and the built site, in a browser"
 	@echo "make clean    remove .venv, caches and build products"
 
 course: $(VENV)/.course-installed
@@ -38,17 +39,20 @@ lint: $(VENV)/.dev-installed
 types: $(VENV)/.dev-installed
 	$(BIN)/mypy
 
-unit: $(VENV)/.dev-installed browser
+unit: $(VENV)/.dev-installed chromium
 	CMC_REQUIRE_BROWSER=1 $(BIN)/python -m pytest -n $(JOBS)
 
 notebooks: $(VENV)/.dev-installed
 	CMC_FAST=1 $(BIN)/python -m pytest --nbmake -n $(JOBS) --durations=0 notebooks/
 
-browser: $(VENV)/.dev-installed
+browser: site chromium
+	CMC_REQUIRE_BROWSER=1 CMC_ALL_LESSONS=1 CMC_SITE="$(CURDIR)/build/site" $(BIN)/python -m pytest tests/test_browser_*.py
+
+chromium: $(VENV)/.dev-installed
 	@$(BIN)/python tests/find_browser.py --install
 
 claims: $(VENV)/.dev-installed
-	$(BIN)/python -m cmc.studies.claims
+	$(BIN)/python site/claims.py
 
 site: $(VENV)/.dev-installed
 	$(BIN)/python site/build.py --jobs $(JOBS)

@@ -1,16 +1,19 @@
 """Build the static site: executed notebooks, live pages, results and the API, all offline.
 
-    python site/build.py [--jobs 2] [--no-run] [--out build/site]
+    python site/build.py [--jobs 2] [--only [NN ...]] [--out build/site]
 
-Sources are laid out in build/site-source, notebooks are executed there, and Sphinx treats every
-warning as an error. Nothing is fetched, and the pages load nothing from elsewhere.
+Sources are laid out beside the site, notebooks are executed there, and Sphinx treats every warning
+as an error. Nothing is fetched, and the pages load nothing from elsewhere.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
+import html
 import importlib
 import inspect
+import json
 import os
 import pkgutil
 import re
@@ -18,157 +21,152 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import cmc
+from cmc import notation, studies
+from cmc.results import tidy
 
 ROOT = Path(__file__).resolve().parent.parent
 SITE = ROOT / "site"
-HIDDEN = {"exercises", "__main__"}
-"""Rooms that are not imported by readers."""
-LIVE = {
-    "two_arms": ["peg_push_half", "--live", "--method", "ctd3", "--beside", "td3"],
-    "peg_maze": ["peg_maze", "--live"],
-    "peg_push": ["peg_push", "--live"],
-}
-"""Live pages and the commands that write them."""
 
 
 def main() -> int:
-    """Lay out, execute, build; returns Sphinx's exit status."""
+    """Lay out, execute, build, check; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--jobs", type=int, default=2, help="notebooks side by side")
-    parser.add_argument("--no-run", action="store_true", help="keep notebooks executed before")
+    parser.add_argument(
+        "--only", nargs="*", metavar="NN", help="execute these lessons, keep others as they are"
+    )
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "site")
     chosen = parser.parse_args()
-    source, started = ROOT / "build" / "site-source", time.monotonic()
-    lay_out(source, keep=chosen.no_run)
-    if not chosen.no_run:
-        execute(source / "notebooks", chosen.jobs)
-    live_pages(source / "live")
-    status = sphinx(source, chosen.out)
-    if status == 0:
-        for folder in ("live", "notebooks/playback"):
-            if (source / folder).is_dir():
-                shutil.copytree(source / folder, chosen.out / folder, dirs_exist_ok=True)
-        prune(chosen.out)
-        size = sum(file.stat().st_size for file in chosen.out.rglob("*") if file.is_file())
-        seconds = time.monotonic() - started
-        print(f"{chosen.out / 'index.html'}: {size / 1e6:.0f} MB in {seconds:.0f} s")
-    return status
+    out, started = chosen.out.resolve(), time.monotonic()
+    source = out.parent / "site-source"
+    if fresh := lay_out(source, chosen.only):
+        execute(fresh, chosen.jobs)
+    shutil.rmtree(out, ignore_errors=True)
+    if sphinx(source, out) != 0:
+        return 1
+    if (source / "notebooks" / "playback").is_dir():
+        shutil.copytree(source / "notebooks" / "playback", out / "notebooks" / "playback")
+        share(out / "notebooks" / "playback")
+    shutil.copytree(ROOT / "assets" / "results", out / "results")
+    prune(out)
+    left_out = out / "notebooks" / "playback"  # by lessons that were never executed here
+    faults = [f for f in broken(out) if chosen.only is None or left_out.name not in f]
+    print("\n".join(faults))
+    size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
+    print(f"{out / 'index.html'}: {size / 1e6:.0f} MB in {time.monotonic() - started:.0f} s")
+    return 1 if faults else 0
 
 
-def lay_out(source: Path, keep: bool) -> None:
-    """Pages of the site beside the notebooks; `keep` leaves executed notebooks where they are."""
-    kept = source / "notebooks"
-    if not (keep and kept.is_dir()):
+def lay_out(source: Path, only: Sequence[str] | None) -> list[Path]:
+    """Pages of the site beside the notebooks; returns the notebooks that are to be executed."""
+    if only is None:
         shutil.rmtree(source, ignore_errors=True)
-        shutil.copytree(ROOT / "notebooks", kept, ignore=shutil.ignore_patterns("playback", ".*"))
+    folder, fresh = source / "notebooks", []
+    folder.mkdir(parents=True, exist_ok=True)
+    for lesson in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        copy = folder / lesson.name
+        if only is None or lesson.name[:2] in only:
+            fresh.append(copy)
+        if copy in fresh or not copy.exists():
+            text = lesson.read_text("utf-8")
+            copy.write_text(text.replace("*all results*", "[all results](../results.md)"), "utf-8")
     for page in [*SITE.glob("*.md"), SITE / "conf.py"]:
         shutil.copy(page, source / page.name)
     shutil.copytree(SITE / "static", source / "static", dirs_exist_ok=True)
     shutil.copy(ROOT / "CHANGELOG.md", source / "changelog.md")
-    lessons = "\n".join(f"notebooks/{p.stem}" for p in sorted(kept.glob("*.ipynb")))
+    lessons = "\n".join(f"notebooks/{p.stem}" for p in sorted(folder.glob("*.ipynb")))
     index = (SITE / "index.md").read_text("utf-8").replace("@@LESSONS@@", lessons)
-    (source / "index.md").write_text(index, "utf-8")
-    (source / "notation.md").write_text(notation(), "utf-8")
-    (source / "results.md").write_text(results(), "utf-8")
-    (source / "api.md").write_text(api(source / "api"), "utf-8")
+    made = {"index": index, "notation": f"# Notation\n\n{notation.table()}\n"}
+    made |= {"results": results(), "api": api(source / "api")}
+    for name, text in made.items():
+        (source / f"{name}.md").write_text(text, "utf-8")
+    return fresh
 
 
-def execute(folder: Path, jobs: int) -> None:
-    """Run all notebooks in place, in fast mode, with sliders that live without a kernel."""
+def execute(notebooks: Sequence[Path], jobs: int) -> None:
+    """Run notebooks in place, in fast mode, with sliders that live without a kernel."""
     settings = {"CMC_FAST": "1", "CMC_EXPORT": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--nbmake"]
-    command += ["--overwrite", "-n", str(jobs), str(folder)]
+    command += ["--overwrite", "-n", str(jobs), *map(str, notebooks)]
     subprocess.run(command, check=True, cwd=ROOT, env={**os.environ, **settings})
 
 
-def live_pages(folder: Path) -> None:
-    """The pages in which MuJoCo runs."""
-    from cmc.__main__ import main as command
-
-    folder.mkdir(exist_ok=True)
-    for name, arguments in LIVE.items():
-        if command(["play", *arguments, "--out", str(folder / f"{name}.html")]) != 0:
-            raise SystemExit(f"the live page {name} could not be written")
-
-
-def notation() -> str:
-    """The table of symbols as a page."""
-    from cmc.notation import table
-
-    return f"# Notation\n\n{table()}\n"
-
-
 def results() -> str:
-    """Last policies of every study, test by test, as a page of tables."""
-    from cmc.results import tidy
-    from cmc.studies import registry
+    """A table for each study: its last policies, test by test, and the files with all rows."""
 
-    parts = ["# All results", "", RESULTS, ""]
-    for name in registry.WHERE:
-        try:
-            data = tidy(name)
-        except (FileNotFoundError, ValueError):
-            continue  # a study without shipped tests
+    def words(values: Any) -> str:
+        few = f"{values.mean():.3g} [{values.min():.3g}, {values.max():.3g}]"
+        return "" if values.isna().all() else few
+
+    parts, files = [RESULTS], {}
+    for file in sorted((ROOT / "assets" / "results").glob("*.csv")):
+        whose = [name for name in studies.WHERE if file.stem.startswith(name)] or [file.stem]
+        link = f'<a href="results/{file.name}">{file.name}</a>'
+        files.setdefault(max(whose, key=len), []).append(link)
+    for name in sorted(files, key=[*studies.WHERE, *files].index):
+        data = tidy(name)
         last = data[data["last"]] if "last" in data else data
-        numbers = last.select_dtypes("number").columns.difference(["seed", "step", "episode"])
+        shown = [key for key in MEASURES if key in last and last[key].notna().any()]
         keys = [key for key in ("title", "test") if key in last]
-        means = last.groupby(keys, sort=False)[list(numbers)].agg(["mean", "min", "max"])
-        parts += [f"## {name}", "", registry.get(name).about, ""]
-        for key in numbers:
-            table = means[key].dropna().reset_index()
-            parts += [f"### {name}: {key}", "", markdown(table), ""]
-        parts += [f"`{data.attrs.get('command', '')}`", ""]
-    return "\n".join(parts)
+        table = (
+            last.groupby(keys, sort=False)[shown]
+            .agg(words)
+            .reset_index()
+            .rename(columns={"title": "method"})
+        )
+        rows = [table.columns, ["---"] * len(table.columns), *table.values]
+        lines = "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
+        about = studies.get(name).about if name in studies.WHERE else "the low level alone"
+        parts += [f"## {name}", f"{about}.", lines]
+        parts += [f"All columns: {', '.join(files[name])}. `{data.attrs.get('command', '')}`"]
+    return "\n\n".join(parts) + "\n"
 
 
-RESULTS = """Every figure that is shipped, as means over seeds of the last policies, with the least
-and the largest seed. `cmc.results` documents columns and units; `tidy(study)` gives the rows."""
+RESULTS = """# All results
 
-
-def markdown(table: Any) -> str:
-    """A data frame as a Markdown table, numbers with four digits."""
-    rows = [list(table.columns), ["---"] * len(table.columns)]
-    rows += [[f"{v:.4g}" if isinstance(v, float) else str(v) for v in row] for row in table.values]
-    return "\n".join("| " + " | ".join(map(str, row)) + " |" for row in rows)
+Means over seeds of the last policies, with the least and the largest seed. Shares are of 1, forces
+in N; `cmc.results` documents all columns of the files, and `tidy(study)` gives their rows. The
+[claims](claims.md) are judged by the same tables."""
+MEASURES = (
+    "success",
+    "touched",
+    "return",
+    "cost",
+    "final_mm",
+    "below_1_N",
+    "largest_N",
+    "oscillation",
+)
+MEASURES += ("drift", "error_f", "slope_x", "slope_z")
 
 
 def api(folder: Path) -> str:
     """One page a room, made from its docstrings; returns the page that lists them."""
     folder.mkdir(exist_ok=True)
     rooms: dict[str, list[str]] = {}
-    for module in pkgutil.walk_packages(cmc.__path__, "cmc."):
-        parts = module.name.split(".")
-        if parts[1] not in HIDDEN and not parts[-1].startswith("_"):
-            rooms.setdefault(parts[1], []).append(module.name)
-    for room, modules in rooms.items():
-        text = [f"# cmc.{room}\n"]
-        for name in modules:
-            pages = markdown_pages(name)
-            left_out = f"   :exclude-members: {', '.join(pages)}\n" if pages else ""
-            text.append(f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n{left_out}```\n")
-            text += [f"### {title}\n\n{page}\n" for title, page in pages.items()]
-        (folder / f"{room}.md").write_text("\n".join(text), "utf-8")
+    for name in [module.name for module in pkgutil.walk_packages(cmc.__path__, "cmc.")]:
+        room, last = name.split(".")[1], name.split(".")[-1]
+        if room in ("exercises", "__main__") or last.startswith("_"):
+            continue
+        # environments document themselves in Markdown: their classes are sections of their own
+        space = vars(importlib.import_module(name))
+        own = {k: v for k, v in space.items() if inspect.isclass(v) and v.__module__ == name}
+        own = {k: doc for k, v in own.items() if "\n## " in (doc := inspect.getdoc(v) or "")}
+        page = f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n"
+        page += f"   :exclude-members: {', '.join(own)}\n```\n\n"
+        for title, doc in own.items():
+            page += f"### {title}\n\n" + doc.replace("\n## ", "\n#### ") + "\n\n"
+        rooms.setdefault(room, [f"# cmc.{room}\n\n"]).append(page)
+    for room, pages in rooms.items():
+        (folder / f"{room}.md").write_text("".join(pages), "utf-8")
     listed = "\n".join(f"api/{room}" for room in rooms)
     return f"# Library\n\n```{{toctree}}\n:maxdepth: 2\n\n{listed}\n```\n"
-
-
-def markdown_pages(module: str) -> dict[str, str]:
-    """Classes of a module that document themselves in Markdown, as environments do."""
-    space = vars(importlib.import_module(module))
-    found = {
-        name: inspect.getdoc(value) or ""
-        for name, value in space.items()
-        if inspect.isclass(value) and value.__module__ == module
-    }
-    return {
-        name: re.sub(r"^##", "####", text, flags=re.MULTILINE)
-        for name, text in found.items()
-        if "\n## " in text
-    }
 
 
 def sphinx(source: Path, out: Path) -> int:
@@ -178,15 +176,56 @@ def sphinx(source: Path, out: Path) -> int:
     return build_main(["-q", "-W", "--keep-going", "-b", "html", str(source), str(out)])
 
 
+def share(folder: Path) -> None:
+    """What all 3D pages hold (viewer, MuJoCo) becomes one file each beside them."""
+    block = re.compile(r"<script(?: type=\"text/plain\" id=\"(\w+)\")?>(.*?)</script>", re.S)
+
+    def moved(match: re.Match[str]) -> str:
+        kind, text = match.groups()
+        if len(text) < 100_000 or text.startswith("const "):  # a page's own data stay in it
+            return match[0]
+        name = hashlib.sha256(text.encode()).hexdigest()[:12] + ".js"
+        made = json.dumps({"type": "text/plain", "id": kind, "textContent": text})
+        element = f'document.head.append(Object.assign(document.createElement("script"), {made}));'
+        (folder / name).write_text(element if kind else text, "utf-8")
+        return f'<script src="{name}"></script>'
+
+    for page in folder.glob("*.html"):
+        text = page.read_text("utf-8")
+        text = text.replace("script-src 'unsafe-inline'", "script-src 'self' file: 'unsafe-inline'")
+        page.write_text(block.sub(moved, text), "utf-8")
+
+
 def prune(out: Path) -> None:
     """Drop what no page uses: MathJax's other input and output formats, Sphinx's own leavings."""
-    for leaving in (".buildinfo", ".doctrees", "objects.inv"):
+    for leaving in (".buildinfo", ".doctrees", "objects.inv", "_static/webpack-macros.html"):
         target = out / leaving
         shutil.rmtree(target, ignore_errors=True) if target.is_dir() else target.unlink(True)
     used = re.compile(r"tex-(mml-)?chtml\.js|/output/chtml/fonts/|/input/tex/extensions/")
     for file in out.rglob("*mathjax*/**/*"):
         if file.is_file() and not used.search(file.as_posix()):
             file.unlink()
+
+
+def broken(out: Path) -> list[str]:
+    """Links and sources that lead nowhere in the site, or that a page would load from elsewhere."""
+    wanted = re.compile(r"<(\w+)\s[^<>]*?\b(href|src)=\"([^\"]*)\"")
+    pages = {page: page.read_text("utf-8") for page in out.rglob("*.html")}
+    names = {page: set(re.findall(r"\bid=\"([^\"]*)\"", text)) for page, text in pages.items()}
+    faults = set()
+    for page, text in pages.items():
+        for tag, _, value in wanted.findall(
+            re.sub(r"<script[^<>]*>.*?</script>", "", text, flags=re.S)
+        ):
+            link = urlsplit(html.unescape(value))
+            target = (page.parent / unquote(link.path)).resolve() if link.path else page
+            if link.scheme in ("http", "https") and tag != "a":
+                faults.add(f"{page.relative_to(out)} loads {value}")
+            elif not link.scheme and not target.exists():
+                faults.add(f"{page.relative_to(out)}: no {value}")
+            elif not link.scheme and link.fragment and link.fragment not in names.get(target, ()):
+                faults.add(f"{page.relative_to(out)}: no place {value}")
+    return sorted(faults)
 
 
 if __name__ == "__main__":

@@ -45,27 +45,35 @@ html_js_files = ["widgets.js"]
 html_sidebars = {"**": []}
 html_show_sourcelink = False
 html_copy_source = False
+html_context = {"default_mode": "auto"}
 html_theme_options = {
     "navbar_align": "left",
     "header_links_before_dropdown": 4,
-    "default_mode": "auto",
     "show_toc_level": 2,
     "secondary_sidebar_items": ["page-toc"],
     "footer_start": ["copyright"],
     "footer_end": [],
     "navigation_with_keys": False,
-    "use_edit_page_button": False,
 }
 
 
 def plain_text(app, what, name, obj, options, lines):
-    """Docstrings are plain text: |x| is a size and a * b a product, not markup."""
-    for k, line in enumerate(lines):
-        parts = re.split(r"(`[^`]*`)", line)
-        parts[::2] = [re.sub(r"([|*])", r"\\\1", part) for part in parts[::2]]
-        line = "".join(parts)
-        # napoleon takes what stands before a colon in an attribute's text for its type
-        lines[k] = line.replace(":", "\N{RATIO}") if what in ("data", "attribute") else line
+    """Docstrings are plain text: |x| is a size, a * b a product, and an indented block is code."""
+    out, code, section = [], False, False
+    for line in lines:
+        section |= line in ("Args:", "Returns:", "Raises:", "Yields:")
+        code &= not line or line.startswith("    ")
+        if line.startswith("    ") and not (section or code or (out and out[-1])):
+            out += ["::", ""]
+            code = True
+        if not code:
+            parts = re.split(r"(`[^`]*`|^ *\* )", line)
+            parts[::2] = [re.sub(r"([|*])", r"\\\1", part) for part in parts[::2]]
+            line = "".join(parts)
+            # napoleon takes what stands before a colon in an attribute's text for its type
+            line = line.replace(":", "\\ \N{RATIO}") if what in ("data", "attribute") else line
+        out.append(line)
+    lines[:] = out
 
 
 def setup(app):

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from cmc.studies import live, peg_maze, peg_push, runner
-from cmc.view.simulator import live_page, save_live_page
+from cmc.view.simulator import live_page
 
 STUDIES = {"peg_maze": peg_maze.STUDY, "peg_push": peg_push.STUDY}
-METHODS = {"peg_maze": ["ctd3"], "peg_push": ["ctd3", "frozen"]}
 pytestmark = pytest.mark.browser
 
 
@@ -17,21 +16,17 @@ pytestmark = pytest.mark.browser
 def pages(browser, tmp_path_factory):
     """Opened pages of both studies, with all that they requested and complained about."""
     opened = {}
+    policies = {name: live.live_policies(study, ["ctd3"]) for name, study in STUDIES.items()}
+    policies["peg_push"] += live.live_policies(peg_push.HALF, ["td3"])
     for name, study in STUDIES.items():
-        task = live.live_task(study, 2)
-        policies = [
-            {**p, "color": color}
-            for p, color in zip(
-                live.live_policies(study, METHODS[name]), ["#0072B2", "#D55E00"], strict=False
-            )
-        ]
-        arms = [{"method": k, "kept": 0, "seed": 0} for k in range(len(policies))]
+        task, arms = live.live_task(study, 2), len(policies[name])
         path = tmp_path_factory.mktemp("live") / f"{name}.html"
-        save_live_page(path, task, policies, title=name, arms=arms, plan=False)
+        path.write_text(live_page(task, policies[name], title=name, arms=arms), "utf-8")
         page = browser.new_page(viewport={"width": 700, "height": 500})
         page.requests, page.errors = [], []
         page.on("request", lambda r, page=page: page.requests.append(r.url))
         page.on("pageerror", lambda e, page=page: page.errors.append(str(e)))
+        page.on("console", lambda m, page=page: m.type == "error" and page.errors.append(m.text))
         page.goto(path.as_uri())
         page.wait_for_function("live.ready || live.failed", timeout=60_000)
         assert page.evaluate("live.failed") is None
@@ -39,20 +34,35 @@ def pages(browser, tmp_path_factory):
     return opened
 
 
-@pytest.mark.parametrize(("name", "start"), [("peg_maze", 0), ("peg_maze", 1), ("peg_push", 1)])
-def test_an_episode_is_the_same_in_the_browser(pages, name, start):
-    page, study = pages[name], STUDIES[name]
-    policy = runner.load(study, "ctd3", seed=1).policy
-    here = study.motion(study.config_of("ctd3"), policy, start)["qpos"][:-1]
+def replay(page, method, seed, start, ticks, **more):
+    """An episode in the browser: joints (ticks, nq) and distances to the sub-goal (ticks,), m."""
+    choice = {"method": method, "kept": 0, "seed": seed}
     page.evaluate(
-        "([start, ticks]) => { live.replayed = null;"
-        " live.replay({method: 0, kept: 0, seed: 1}, start, ticks); }",
-        [start, len(here)],
+        "([...of]) => { live.replayed = null; live.replay(...of); }", [choice, start, ticks, more]
     )
     page.wait_for_function("live.replayed", timeout=60_000)
-    there = np.array(page.evaluate("live.replayed"))
+    return [np.array(page.evaluate(f"live.replayed.{key}")) for key in ("qpos", "away")]
+
+
+@pytest.mark.parametrize(("name", "start"), [("peg_maze", 0), ("peg_maze", 1), ("peg_push", 1)])
+def test_an_episode_is_the_same_in_the_browser(pages, name, start):
+    study = STUDIES[name]
+    policy = runner.load(study, "ctd3", seed=1).policy
+    here = study.motion(study.config_of("ctd3"), policy, start)["qpos"][:-1]
+    there, _ = replay(pages[name], 0, 1, start, len(here))
     assert np.ptp(here[:, :7], axis=0).max() > 0.01  # the arm moved
     assert np.abs(there - here).max() < 1e-4  # rad
+
+
+def test_every_contracting_seed_rests_after_a_push_and_free_ones_drift(pages):
+    """A sub-goal in free space, and 5 N for 0.2 s after 4 s; contracting arms rest 9 s later."""
+    more = {"target": pages["peg_push"].evaluate("PAGE.target"), "force": [5, 0, 0]}
+    for seed in range(5):
+        _, away = replay(pages["peg_push"], 0, seed, 0, 660, span=[200, 210], **more)
+        assert away[200:].max() > 3e-4
+        assert max(away[199], away[-1]) < 1e-5
+    free = [replay(pages["peg_push"], 1, seed, 0, 200, **more)[1][-1] for seed in range(5)]
+    assert np.median(free) > 1e-3
 
 
 def test_nothing_is_loaded_and_nothing_fails(pages):
@@ -97,7 +107,8 @@ def test_controls_work_by_keyboard(pages):
     page.wait_for_function("live.states[0].pushed[2] > 0", timeout=10_000)
     page.keyboard.up("PageUp")
     page.wait_for_function("live.states[0].pushed[2] === 0", timeout=10_000)
-    page.get_by_role("button", name="you set the sub-goal").press("Enter")
+    for name in ("planner sets the sub-goals", "you set the sub-goal"):
+        page.get_by_role("button", name=name).press("Enter")
     before = page.evaluate("live.states[0].target")
     page.wait_for_function(
         "(before) => live.states[0].target.some((x, k) => x !== before[k])", arg=before
@@ -105,7 +116,9 @@ def test_controls_work_by_keyboard(pages):
 
 
 def test_bad_arms_are_refused():
-    with pytest.raises(ValueError, match="wanted one or two, got 3"):
-        live_page({}, [], title="", arms=[{}] * 3)
-    with pytest.raises(ValueError, match="no policy"):
-        live_page({}, [], title="", arms=[{"method": 0, "kept": 0, "seed": 0}])
+    one = {"name": "ctd3", "kept": [{"seeds": [0, 1]}]}
+    for arms, policies in ((3, 3 * [one]), (2, [one])):
+        with pytest.raises(ValueError, match=f"wanted 1 or 2, .* got {arms}"):
+            live_page({}, policies, title="", arms=arms)
+    with pytest.raises(ValueError, match="wanted 0 to 1 for ctd3, got 2"):
+        live_page({}, [one], title="", seed=2)

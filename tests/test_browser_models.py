@@ -1,11 +1,12 @@
 """Models of others in the real page: what changes shape, cameras, textures, twins, two scenes."""
 
-from __future__ import annotations
+import itertools
 
 import mujoco
 import numpy as np
 import pytest
-from test_browser_playback import matrix, picture, until
+from test_browser_playback import matrix, offline, picture, until
+from test_view_playback import at, attribute, commands, load
 
 from cmc.view.playback import beside, record
 
@@ -65,36 +66,15 @@ WORM = """<mujoco><asset><mesh name="tetra" vertex="0 0 0 .1 0 0 0 .1 0 0 0 .1"/
 
 @pytest.fixture
 def opened(browser, tmp_path):
-    """Save what plays and open it, offline; nothing may fail, nothing be asked for."""
-    pages = []
+    """Save what plays and open it."""
+    with offline(browser, 400, 300) as open_:
 
-    def open_(made):
-        page = browser.new_context(offline=True, viewport={"width": 400, "height": 300}).new_page()
-        page.failed, page.asked = [], []
-        page.on("pageerror", lambda error: page.failed.append(str(error)))
-        page.on("console", lambda line: line.type == "error" and page.failed.append(line.text))
-        page.on("request", lambda request: page.asked.append(request.url))
-        page.goto(made.save(tmp_path / f"{len(pages)}.html").as_uri())
-        until(page, "window.cmcPlayback")
-        pages.append(page)
-        return page
+        def save_and_open(made):
+            page = open_(made.save(tmp_path / "page.html"))
+            until(page, "window.cmcPlayback")
+            return page
 
-    yield open_
-    for page in pages:
-        assert page.failed == []
-        assert [url for url in page.asked if not url.startswith(("file:", "blob:", "data:"))] == []
-        page.context.close()
-
-
-def load(xml):
-    return mujoco.MjModel.from_xml_string(xml)
-
-
-def at(model, qpos):
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    mujoco.mj_forward(model, data)
-    return data
+        yield save_and_open
 
 
 def corners(page, name):
@@ -144,26 +124,29 @@ def test_a_string_runs_over_its_pulley(opened):
     np.testing.assert_allclose(tubes[:3, 1], path[1:], atol=1e-4)
 
 
-def test_twin_names_stay_four_bodies(opened):
-    model = load(TWINS)
-    qpos = np.array([[0.1, 0.2, 0.3, 0.4], [0.0, 0.0, 0.0, 0.0]])
-    made = record(model, qpos, [0.0, 1.0])
+def test_twin_names_stay_four_bodies_and_labels_stand_beside_them(opened):
+    model, labels = load(TWINS), {"ball": "body2", "here": [1, 2, 3]}
+    qpos = np.array([[0.0, 0.0, 0.0, 0.0], [0.1, 0.2, 0.3, 0.4]])
+    made = record(model, qpos, [0.0, 1.0], labels=labels)
     assert len(set(made.bodies)) == 4
     page = opened(made)
-    data = at(model, qpos[0])
+    page.evaluate("cmcPlayback.seek(1)")
+    data = at(model, qpos[1])
     for body, name in enumerate(made.bodies, start=1):
         np.testing.assert_allclose(matrix(page, name)[:3, 3], data.xpos[body], atol=1e-6)
+    place = "cmcPlayback.viewer.scene.getObjectByName('overlay {}').position.toArray()"
+    np.testing.assert_allclose(page.evaluate(place.format("ball")), data.xpos[1], atol=1e-6)
+    assert page.evaluate(place.format("here")) == [1, 2, 3]
 
 
-def run_ten_metres():
+def test_cameras_and_textures_of_a_runner(opened):
+    """With the first preset it stays near the middle over ten metres.
+
+    The model's own cameras have MuJoCo's position, direction, roll and field of view meanwhile.
+    """
     model = load(RUNNER)
     qpos = np.stack([np.linspace(0, 10, 21), np.linspace(0, 1, 21)], axis=1)
-    return model, qpos, record(model, qpos, np.linspace(0, 2, 21))
-
-
-def test_what_runs_stays_in_the_picture(opened):
-    """With the first preset, the runner is near the middle at the start and after ten metres."""
-    _, _, made = run_ten_metres()
+    made = record(model, qpos, np.linspace(0, 2, 21))
     page = opened(made)
     for t in (0, 1.03, 2):
         page.evaluate(f"cmcPlayback.seek({t})")
@@ -178,15 +161,8 @@ def test_what_runs_stays_in_the_picture(opened):
             }"""
         )
         assert np.abs(seen[:2]).max() < 0.5
-
-
-@pytest.mark.parametrize("name", ["track", "rider"])
-def test_a_camera_of_the_model_shows_what_mujoco_s_does(opened, name):
-    """Position, direction, roll and field of view, while it moves."""
-    model, qpos, made = run_ten_metres()
-    page = opened(made)
-    page.evaluate(f"cmcPlayback.look({list(made.cameras).index(name)})")
-    for frame in (0, 7, 20):
+    for name, frame in itertools.product(("track", "rider"), (0, 7, 20)):
+        page.evaluate(f"cmcPlayback.look({list(made.cameras).index(name)})")
         page.evaluate(f"cmcPlayback.seek({made.times[frame]})")
         seen = page.evaluate(CAMERA)
         data, camera = at(model, qpos[frame]), model.camera(name).id
@@ -195,11 +171,7 @@ def test_a_camera_of_the_model_shows_what_mujoco_s_does(opened, name):
         turned = Z_UP @ data.cam_xmat[camera].reshape(3, 3)
         np.testing.assert_allclose(world[:3, :3], turned, atol=1e-3)
         assert seen["fov"] == model.cam_fovy[camera]
-
-
-def test_textures_are_mapped_on_floors_and_boxes(opened):
-    model, _, made = run_ten_metres()
-    page = opened(made)
+    page.evaluate("cmcPlayback.look(0); cmcPlayback.seek(0)")
     for name in ("floor", "box"):
         path = ["meshcat", "world", f"geom{model.geom(name).id}", "<object>"]
         found = "cmcPlayback.viewer.scene_tree.find(" + str(path) + ").object"
@@ -231,15 +203,8 @@ def test_a_mesh_used_often_is_stored_and_held_once(opened):
           return [shapes.size, corners];
         }"""
     )
-    assert held == [1, 30 * len(load_corners(one))]
-
-
-def load_corners(made):
-    import umsgpack
-
-    command = next(c for c in map(umsgpack.unpackb, made.commands) if c["type"] == "set_object")
-    packed = command["object"]["geometries"][0]["data"]["attributes"]["position"]["array"].data
-    return np.frombuffer(packed, np.float32).reshape(-1, 3)
+    (mesh,) = (c["object"] for c in commands(one, "set_object").values())
+    assert held == [1, 30 * len(attribute(mesh, "position"))]
 
 
 def test_two_scenes_play_side_by_side_under_one_slider(opened):
@@ -257,13 +222,3 @@ def test_two_scenes_play_side_by_side_under_one_slider(opened):
     assert where == pytest.approx([0.1, 0.9])  # the shorter one stays at its end
     with pytest.raises(ValueError, match="at least one"):
         beside()
-
-
-def test_a_label_stands_beside_its_part(opened):
-    model = load(TWINS)
-    qpos = np.array([[0.0, 0.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0]])
-    page = opened(record(model, qpos, [0.0, 1.0], labels={"ball": "body2", "here": [1, 2, 3]}))
-    page.evaluate("cmcPlayback.seek(1)")
-    place = "cmcPlayback.viewer.scene.getObjectByName('overlay {}').position.toArray()"
-    np.testing.assert_allclose(page.evaluate(place.format("ball")), [0.5, 0, 1], atol=1e-6)
-    assert page.evaluate(place.format("here")) == [1, 2, 3]

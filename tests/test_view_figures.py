@@ -29,59 +29,47 @@ def spiral(number=6):
 
 def drawn():
     t, paths = spiral()
-    points = figures.grid((-2, 2), (-1, 3), 9)
     rng = np.random.default_rng(0)
     return {
-        "phase_portrait": figures.phase_portrait(points, -points, paths, equilibrium=[0, 0]),
-        "phase_portrait without a field": figures.phase_portrait(paths=paths[:, 0]),
         "trajectories": figures.trajectories(t, paths[..., 0], name="bundle", target=0.0),
-        "distances": figures.distances(t, np.exp(-t), rate=1.0),
-        "convergence": figures.convergence(t, paths, rate=0.5, overshoot=1.5),
-        "eigenvalues": figures.eigenvalues({"$F_{11}$": [-1 + 2j, -1 - 2j]}),
-        "eigenvalues of a sampled loop": figures.eigenvalues([0.5, -0.2j], region="disc"),
+        "distances": figures.trajectories(t, np.exp(-t), log=True),
         "matrix": figures.matrix(np.eye(4), block=2, labels=list("abcd"), title="$F$"),
         "matrices": figures.matrices({"$R$": np.eye(2), "$F$": np.ones((4, 4))}),
         "curves": figures.curves(t, {"a": t + 1, "b": t**2 + 1}, labels=("t (s)", "y"), log="xy"),
-        "histogram": figures.histogram({"a": rng.normal(size=99)}, label_x="error (N)", log=True),
-        "learning_curves": figures.learning_curves(t, {"TD3": rng.normal(size=(3, 80))}),
+        "histogram": figures.histogram({"a": rng.normal(size=99)}, label_x="error (N)"),
         "region": figures.region(t, t[:5], rng.normal(size=(5, 80)), labels=("a", "b", "c")),
     }
 
 
-def test_every_figure_is_drawn_inside_its_frame(tmp_path):
-    """Not blank, and nothing of it (labels included) touches the edge of the picture."""
-    for name, figure in drawn().items():
-        pixels = imread(figures.save(figure, tmp_path / "figure.png", name))[..., :3]
-        assert pixels.std() > 0.02, name
-        edge = np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])
-        assert edge.min() > 0.98, f"{name} is cut off"
-
-
-def test_every_figure_with_data_has_labels_with_units_where_it_has_axes():
+def test_every_figure_is_drawn_inside_its_frame_with_labels(tmp_path):
+    """Not blank, nothing of it (labels included) touches the edge; its description is inside."""
     for name, figure in drawn().items():
         for ax in figure.axes:
             if ax.axison and len(ax.get_xticks()) and not name.startswith("matri"):
                 assert ax.get_xlabel() or ax.get_ylabel(), name
-
-
-def test_a_saved_figure_carries_its_description(tmp_path):
-    file = figures.save(figures.trajectories([0, 1], [1, 2]), tmp_path / "a.png", "One line rises.")
-    assert Image.open(file).text["Description"] == "One line rises."
+        file = figures.save(figure, tmp_path / "figure.png", name)
+        pixels = imread(file)[..., :3]
+        assert pixels.std() > 0.02, name
+        edge = np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])
+        assert edge.min() > 0.98, f"{name} is cut off"
+        assert Image.open(file).text["Description"] == name
     assert plt.get_fignums() == []
 
 
-def test_describe_shows_the_picture_with_its_line_and_closes_it(monkeypatch):
-    shown = []
+@pytest.fixture
+def shown(monkeypatch):
+    pictures = []
     monkeypatch.setattr("IPython.get_ipython", lambda: object())
-    monkeypatch.setattr("IPython.display.display", shown.append)
+    monkeypatch.setattr("IPython.display.display", lambda bundle, raw: pictures.append(bundle))
+    return pictures
+
+
+def test_describe_shows_the_picture_with_its_line_and_closes_it(shown):
     figure = figures.trajectories([0, 1], [1, 2])
     figures.describe(figure, 'A line rises from 1 to 2: "fast" & <steep>.')
-    (picture,) = shown
-    bundle = picture._repr_mimebundle_()
-    assert (
-        'alt="A line rises from 1 to 2: &quot;fast&quot; &amp; &lt;steep&gt;."'
-        in bundle["text/html"]
-    )
+    (bundle,) = shown
+    words = "A line rises from 1 to 2: &quot;fast&quot; &amp; &lt;steep&gt;."
+    assert f'alt="{words}"' in bundle["text/html"]
     assert "<figcaption" in bundle["text/html"]
     assert bundle["text/plain"] == 'Figure: A line rises from 1 to 2: "fast" & <steep>.'
     assert plt.get_fignums() == []
@@ -92,27 +80,18 @@ def schematics():
 
 
 @pytest.mark.parametrize("name", schematics())
-def test_a_schematic_is_shown_with_its_own_line(name, monkeypatch):
-    """It is well-formed, draws something, holds no script and loads nothing."""
-    shown = []
-    monkeypatch.setattr("IPython.get_ipython", lambda: object())
-    monkeypatch.setattr("IPython.display.display", shown.append)
-    figures.schematic(name)
-    (picture,) = shown
-    root = ElementTree.fromstring(picture.data)
-    assert root.findtext("{*}title") == picture.text
-    assert picture.text.endswith(".")
+def test_a_schematic_is_shown_with_a_line(name, shown):
+    """It is well-formed, has a title, draws something, holds no script and loads nothing."""
+    figures.schematic(name, "What it shows.")
+    (bundle,), data = shown, (asset("schematics") / f"{name}.svg").read_bytes()
+    root = ElementTree.fromstring(data)
+    assert root.findtext("{*}title").endswith(".")
     tags = [node.tag.split("}")[-1] for node in root.iter()]
     assert tags.count("path") > 5
     assert not set(tags) & {"script", "image", "a"}
-    assert b'href="http' not in picture.data
-    assert "data:image/svg+xml;base64" in picture._repr_mimebundle_()["text/html"]
-
-
-@pytest.mark.parametrize("text", ["", "  ", "two\nlines"])
-def test_a_description_is_one_line(text):
-    with pytest.raises(ValueError, match="one line that describes"):
-        figures.describe(figures.trajectories([0, 1], [1, 2]), text)
+    assert b'href="http' not in data
+    assert 'alt="What it shows."' in bundle["text/html"]
+    assert "data:image/svg+xml;base64" in bundle["text/html"]
 
 
 def deuteranope(colors):
@@ -137,36 +116,27 @@ def test_a_method_has_one_color_and_line_wherever_it_is_drawn():
     drawn = figures.curves([0, 1], lines, labels=("x", "y")).axes[0].get_lines()
     assert [line.get_color() for line in drawn] == [orange, figures.CYCLE[2], blue]
     assert [line.get_linestyle() for line in drawn] == ["--", "-", "-"]
-    assert style.method_of("TD3/C-TD3, the paper's scheme") == "ctd3_paper"
+    assert style._method_of("TD3/C-TD3, the paper's scheme") == "ctd3_paper"
 
 
 def test_titles_are_those_of_the_studies():
-    from cmc.studies import registry
+    from cmc import studies
 
     for study in ("peg_touch", "peg_maze", "peg_push"):
-        methods = registry.get(study).methods
+        methods = studies.get(study).methods
         assert {n: m.title for n, m in methods.items()}.items() <= figures.METHOD_TITLES.items()
 
 
 def test_methods_of_one_study_differ_in_more_than_red_and_green():
     """Seen by a deuteranope, two methods with one line style never have one color."""
-    two_levels = list(style.METHOD_COLORS).index("cppo")
-    for names in np.split(np.array(list(style.METHOD_COLORS)), [two_levels]):
-        for line in set(style.METHOD_LINES.values()):
-            same = [n for n in names if style.METHOD_LINES[n] == line]
+    names = list(style.METHODS)
+    two_levels = names.index("cppo")
+    for study in (names[:two_levels], names[two_levels:]):
+        for line in {row["line"] for row in style.METHODS.values()}:
+            same = [n for n in study if style.METHODS[n]["line"] == line]
             seen = deuteranope([figures.METHOD_COLORS[n] for n in same])
             apart = np.linalg.norm(seen[:, None] - seen[None], axis=-1) + np.eye(len(same))
             assert apart.min() > 0.08, same
-
-
-def test_the_envelope_bounds_what_contracts_at_its_rate():
-    t, paths = spiral()
-    figure = figures.convergence(t, paths, rate=0.5)
-    lines = figure.axes[1].get_lines()
-    envelope = np.asarray(lines[-1].get_ydata(), float)
-    assert lines[-1].get_label() == "rate 0.5 1/s"
-    for line in lines[:-1]:
-        assert (np.asarray(line.get_ydata(), float) <= envelope * (1 + 1e-9)).all()
 
 
 def test_zero_entries_are_written_as_zero_and_stay_white():
@@ -183,34 +153,23 @@ def test_a_histogram_counts_every_sample():
     np.testing.assert_allclose(heights[-1], [0.25, 0.0, 0.5, 0.25])
 
 
-def test_learning_curves_show_median_and_range_over_seeds():
-    steps = np.arange(4.0)
-    runs = np.array([[0.0, 1, 2, 3], [10, 11, 12, 13], [2, 3, 4, 5]])
-    ax = figures.learning_curves(steps, {"m": runs}, each_seed=False).axes[0]
-    np.testing.assert_allclose(ax.get_lines()[0].get_ydata(), runs[2])
-    low, high = ax.collections[0].get_paths()[0].vertices[:, 1].min(), 13
-    assert (low, high) == (0.0, ax.collections[0].get_paths()[0].vertices[:, 1].max())
-    assert ax.get_legend().get_texts()[0].get_text() == "m (3 seeds)"
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: figures.phase_portrait(np.zeros((5, 2)), np.zeros((5, 2))), r"use grid\(\)"),
-        (lambda: figures.phase_portrait(paths=np.zeros(5)), "wanted trajectories"),
-        (lambda: figures.convergence([0, 1], np.zeros((2, 3, 1))), "wanted trajectories"),
         (lambda: figures.matrix(np.zeros(3)), r"wanted a matrix \(rows, columns\)"),
         (lambda: figures.matrices({}), "at least one matrix"),
-        (lambda: figures.eigenvalues([1.0], region="circle"), "'half-plane' or 'disc'"),
-        (
-            lambda: figures.learning_curves([0, 1], {"a": np.zeros((3, 4))}),
-            r"a: wanted \(seeds, 2\)",
-        ),
         (
             lambda: figures.region([0, 1], [0, 1], np.zeros((3, 2)), labels=("", "", "")),
             "got shape",
         ),
-        (lambda: figures.schematic("serial"), "no schematic 'serial'; there are"),
+        *[
+            (
+                lambda text=text: figures.describe(figures.trajectories([0, 1], [1, 2]), text),
+                "one line",
+            )
+            for text in ("", "  ", "two\nlines")
+        ],
+        (lambda: figures.schematic("serial", "d"), "no schematic 'serial'; there are"),
     ],
 )
 def test_bad_input_is_named(call, message):
@@ -219,8 +178,8 @@ def test_bad_input_is_named(call, message):
 
 
 def test_the_style_leaves_other_figures_to_the_reader():
-    """Importing sets nothing; `use_style` does."""
+    """Importing sets nothing; a figure of the course does."""
     with mpl.rc_context():
         mpl.rcdefaults()
-        style.use_style()
-        assert mpl.rcParams["axes.prop_cycle"].by_key()["color"][0] == figures.COLORS["blue"]
+        figures.panels()
+        assert mpl.rcParams["axes.prop_cycle"].by_key()["color"] == list(figures.CYCLE)

@@ -11,16 +11,23 @@ import mujoco
 import numpy as np
 import pytest
 import umsgpack
-from test_view_playback import SCENE, tumble
+from test_view_playback import SCENE, tumbled
 from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
-from cmc.view.playback import record
-
 
 @pytest.fixture(scope="module")
-def model():
-    return mujoco.MjModel.from_xml_string(SCENE)
+def recording():
+    return tumbled(mujoco.MjModel.from_xml_string(SCENE), 1)
+
+
+@pytest.fixture
+def moved():
+    """MuJoCo's data with the torso at x = 0.25 m."""
+    data = mujoco.MjData(mujoco.MjModel.from_xml_string(SCENE))
+    data.qpos[0] = 0.25
+    mujoco.mj_kinematics(data.model, data)
+    return data
 
 
 def refused(port, host="127.0.0.1"):
@@ -29,47 +36,51 @@ def refused(port, host="127.0.0.1"):
         return probe.connect_ex((host, port)) != 0
 
 
-async def follow(url, count, act):
-    """Connect as a browser does, read the scene, act, read `count` more messages."""
-    client = await websocket_connect(url.replace("http", "ws") + "socket")
-    received = []
-    while not received or received[-1]["path"] != "/meshcat/last":
-        received.append(umsgpack.unpackb(await asyncio.wait_for(client.read_message(), 5)))
-    act()
-    fresh = [
-        umsgpack.unpackb(await asyncio.wait_for(client.read_message(), 5)) for _ in range(count)
-    ]
+def socket_of(live):
+    return live.url.replace("http", "ws") + "socket"
+
+
+async def follow(live, moved):
+    """Connect as a browser does, read the scene, move the bodies, read four more messages."""
+    client = await websocket_connect(socket_of(live))
+
+    async def read():
+        return umsgpack.unpackb(await asyncio.wait_for(client.read_message(), 5))
+
+    received = [await read()]
+    while received[-1]["path"] != "/meshcat/last":
+        received.append(await read())
+    live.update(moved)
+    fresh = [await read() for _ in range(4)]
     client.close()
-    return received, fresh
+    return received, {c["path"]: np.reshape(c["matrix"], (4, 4)).T for c in fresh}
 
 
-def test_live_view_serves_drives_and_leaves_nothing(model):
-    qpos, _, times = tumble(model, frames=1)
+def mark_end(live):
+    live.send(type="set_property", path="/meshcat/last", property="visible", value=True)
+
+
+def test_live_view_serves_drives_and_leaves_nothing(recording, moved):
     before = set(threading.enumerate())
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos[0]
-    data.qpos[0] = 0.25
-    mujoco.mj_kinematics(model, data)
-    with record(model, qpos, times).serve(timeout=30) as live:
+    with recording.serve(timeout=30) as live:
         with urllib.request.urlopen(live.url, timeout=5) as answer:
             assert b"cmcPlayback" in answer.read()
-        live.visualizer["last"].set_property("visible", True)  # marks the end of the scene
-        scene, fresh = asyncio.run(follow(live.url, 4, lambda: live.update(data)))
+            assert "frame-ancestors" in answer.headers["Content-Security-Policy"]
+        mark_end(live)
+        scene, places = asyncio.run(follow(live, moved))
         assert {c["type"] for c in scene} == {"set_object", "set_transform", "set_property"}
-        moved = {c["path"]: np.reshape(c["matrix"], (4, 4)).T for c in fresh}
-        np.testing.assert_allclose(moved["/meshcat/torso"][:3, 3], data.body("torso").xpos)
+        np.testing.assert_allclose(places["/meshcat/torso"][:3, 3], moved.body("torso").xpos)
         assert refused(live.port, "127.0.0.2")  # a server on all interfaces would answer here
     live.close()
     assert live.closed
     assert set(threading.enumerate()) <= before
     assert refused(live.port)
     with pytest.raises(RuntimeError, match="closed"):
-        live.update(data)
+        live.update(moved)
 
 
-def test_live_view_closes_itself(model):
-    qpos, _, times = tumble(model, frames=1)
-    live = record(model, qpos, times).serve(timeout=0.1)
+def test_live_view_closes_itself(recording):
+    live = recording.serve(timeout=0.1)
     deadline = time.monotonic() + 5
     while not live.closed and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -77,24 +88,30 @@ def test_live_view_closes_itself(model):
     assert refused(live.port)
     live.close()
     with pytest.raises(ValueError, match="timeout"):
-        record(model, qpos, times).serve(timeout=0)
+        recording.serve(timeout=0)
 
 
-def test_live_view_answers_no_foreign_host_or_origin(model):
-    qpos, _, times = tumble(model, frames=1)
-    with record(model, qpos, times).serve(timeout=30) as live:
+def test_live_view_answers_no_foreign_host_or_origin_and_obeys_no_browser(recording):
+    async def knock():
+        evil = {"Origin": "http://evil.example"}
+        await websocket_connect(HTTPRequest(socket_of(live), headers=evil))
+
+    async def shout():
+        client = await websocket_connect(socket_of(live))
+        await client.write_message(umsgpack.packb({"type": "delete", "path": "/"}), binary=True)
+        await client.write_message("x" * 1000)
+        await asyncio.wait_for(client.read_message(), 5)
+        client.close()
+
+    with recording.serve(timeout=30) as live:
         request = urllib.request.Request(live.url, headers={"Host": "evil.example"})
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(request, timeout=5)
-        foreign = HTTPRequest(
-            live.url.replace("http", "ws") + "socket", headers={"Origin": "http://evil.example"}
-        )
-
-        async def knock():
-            await websocket_connect(foreign)
-
         with pytest.raises(HTTPClientError, match="403"):
             asyncio.run(knock())
+        before = dict(live.commands)
+        asyncio.run(shout())
+        assert live.commands == before
 
 
 def stalled(live):
@@ -111,48 +128,22 @@ def stalled(live):
     return lazy
 
 
-def test_a_browser_that_stops_reading_starves_nobody(model):
+def test_a_browser_that_stops_reading_starves_nobody(recording, moved):
     """Others follow, the view closes at once, and its port is free."""
-    qpos, _, times = tumble(model, frames=1)
-    data = mujoco.MjData(model)
-    live = record(model, qpos, times).serve(timeout=60)
+    live = recording.serve(timeout=60)
     with stalled(live):
         while not live.sockets:
             time.sleep(0.01)
-        heavy = live.visualizer["heavy"]
         for _ in range(40):  # more than any buffer on the way holds
-            heavy.set_property("note", "x" * 1_000_000)
+            note = {"property": "note", "value": "x" * 1_000_000}
+            live.send(type="set_property", path="/meshcat/heavy", **note)
             time.sleep(0.02)
-
-        def act():
-            data.qpos[0] = 0.5
-            mujoco.mj_kinematics(model, data)
-            live.update(data)
-
         assert any(browser.waiting for browser in live.sockets)  # it does not get them
-        live.visualizer["last"].set_property("visible", True)
-        _, fresh = asyncio.run(follow(live.url, 4, act))
-        assert any(c["path"] == "/meshcat/torso" for c in fresh)
+        mark_end(live)
+        _, places = asyncio.run(follow(live, moved))
+        assert "/meshcat/torso" in places
         began = time.monotonic()
         live.close()
         assert live.closed
         assert time.monotonic() - began < 4
     assert refused(live.port)
-
-
-def test_what_a_browser_sends_moves_nothing(model):
-    qpos, _, times = tumble(model, frames=1)
-    with record(model, qpos, times).serve(timeout=30) as live:
-        before = dict(live.commands)
-
-        async def shout():
-            client = await websocket_connect(live.url.replace("http", "ws") + "socket")
-            await client.write_message(umsgpack.packb({"type": "delete", "path": "/"}), binary=True)
-            await client.write_message("x" * 1000)
-            await asyncio.wait_for(client.read_message(), 5)
-            client.close()
-
-        asyncio.run(shout())
-        assert live.commands == before
-        with urllib.request.urlopen(live.url, timeout=5) as answer:
-            assert "frame-ancestors" in answer.headers["Content-Security-Policy"]

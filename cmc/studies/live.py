@@ -19,15 +19,12 @@ CHOICE = ("ctd3", "frozen", "td3_corrected", "control")
 """Methods that a live page offers beside those it was asked for."""
 
 
-def playable(study: Study) -> list[str]:
-    """Shipped methods of `CHOICE`.
-
-    Raises:
-        ValueError: for a study without an arm.
-    """
+def playable(study: Study, first: Sequence[str] = ()) -> list[str]:
+    """The methods `first`, then the shipped ones of `CHOICE`; a ValueError without an arm."""
     if not hasattr(study.config, "task_class"):
         raise ValueError(f"{study.name} has no arm to play live; wanted peg_maze or peg_push")
-    return [name for name in CHOICE if name in study.methods and find(study, name).is_file()]
+    rest = [name for name in CHOICE if name in study.methods and find(study, name).is_file()]
+    return list(dict.fromkeys([*first, *rest]))
 
 
 def live_task(study: Study, starts: int = 5) -> dict[str, Any]:
@@ -44,23 +41,20 @@ def live_task(study: Study, starts: int = 5) -> dict[str, Any]:
     def row(table: Any, name: str, default: float) -> list[float]:
         return np.broadcast_to(table.get(name, default), (sizes[name],)).astype(float).tolist()
 
-    law = c.law
+    gains = {name: getattr(latent, name).tolist() for name in ("K_p", "K_d", "K1", "K2")}
+    law = ("form", "split", "error_limit", "pivot_floor", "posture_stiffness", "posture_damping")
+    own = ("tick", "horizon", "ticks", "increments", "tilt_limit", "u_limit")
+    ends = [f"{of}_{end}" for of in ("subgoal", "workspace") for end in ("low", "high")]
+    each = zip(task.worlds.qpos, goals, strict=True)
     return {
         "xml": spec.to_xml(),
         "substeps": round(c.tick / c.timestep),
         "compliant": c.peg.stiffness > 0,
-        "K_p": latent.K_p.tolist(),
-        "K_d": latent.K_d.tolist(),
-        "K1": latent.K1.tolist(),
-        "K2": latent.K2.tolist(),
+        **gains,
         "integrates": [1.0] * 3 + [0.0] * 3,
-        **{name: getattr(law, name) for name in ("form", "split", "error_limit", "pivot_floor")},
-        **{name: getattr(law, name) for name in ("posture_stiffness", "posture_damping")},
+        **{name: getattr(c.law, name) for name in law},
         "posture": start_joints(c).tolist(),
-        **{name: getattr(c, name) for name in ("tick", "horizon", "ticks", "increments")},
-        **{name: getattr(c, name) for name in ("tilt_limit", "u_limit")},
-        **{f"subgoal_{end}": getattr(c, f"subgoal_{end}") for end in ("low", "high")},
-        **{f"workspace_{end}": getattr(c, f"workspace_{end}") for end in ("low", "high")},
+        **{name: getattr(c, name) for name in (*own, *ends)},
         "planning": [
             {
                 "name": name,
@@ -69,37 +63,24 @@ def live_task(study: Study, starts: int = 5) -> dict[str, Any]:
             }
             for name in planning.fields or task.high_level
         ],
-        "starts": [
-            {"qpos": task.worlds.qpos[k].tolist(), "goal": goals[k].tolist()} for k in range(starts)
-        ],
+        "starts": [{"qpos": qpos.tolist(), "goal": goal.tolist()} for qpos, goal in each],
     }
 
 
-def live_policies(
-    study: Study, methods: Sequence[str], steps: Sequence[int] | None = None
-) -> list[dict[str, Any]]:
-    """Planner and low level of every method, kept policy and seed, as nested lists of arrays.
-
-    Args:
-        study: configuration.
-        methods: names; those with a low level of the tip, or none.
-        steps: which kept policies; the last one of each method if None.
-    """
+def live_policies(study: Study, methods: Sequence[str]) -> list[dict[str, Any]]:
+    """Planner and low level of every shipped policy and seed of methods, as nested lists."""
     found = []
     for name in methods:
-        kept = []
         if study.config_of(name).task.command != "pose":
             raise ValueError(f"{name} moves joints; a live page plays methods that move the tip")
-        marks = marks_of(store.load_checkpoint(find(study, name))[0])
-        for step in marks[-1:] if steps is None else [m for m in marks if m in steps][-3:]:
-            loaded = load(study, name, step)
-            planner, low = loaded.policy
-            actor = getattr(low, "actor", None)
+        kept = []
+        for mark in marks_of(store.load_checkpoint(find(study, name))[0]):
+            (planner, low), step, seeds = load(study, name, mark)
             policies = [
-                {"planner": _layers(planner.network.mlp, k, 1)[0], "low": _low(actor, k)}
-                for k in range(len(loaded.seeds))
+                {"planner": _layers(planner.network.mlp, k, 1)[0], "low": _low(low.actor, k)}
+                for k in range(len(seeds))
             ]
-            kept.append({"step": step, "seeds": loaded.seeds, "policies": policies})
+            kept.append({"step": step, "seeds": seeds, "policies": policies})
         found.append({"name": name, "title": study.method(name).title, "kept": kept})
     return found
 
@@ -110,8 +91,7 @@ def _low(actor: nn.Module | None, seed: int) -> dict[str, Any]:
     net: Any = actor.network
     if not hasattr(net, "mlp"):  # the same gain for y and its integral
         return {"kind": "gain", "gain": net.gains[:, 0].numpy()}
-    weights = net.positive_weights() if hasattr(net, "positive_weights") else None
-    return {"kind": "networks", "networks": _layers(net.mlp, seed, net.n, weights)}
+    return {"kind": "networks", "networks": _layers(net.mlp, seed, net.n, net.used_weights())}
 
 
 def _layers(

@@ -222,23 +222,6 @@ const draw = {
     }
   },
 
-  arrows(ctx, ax, layer, get) {
-    const x = get(layer.x), y = get(layer.y), dx = get(layer.dx), dy = get(layer.dy);
-    ctx.lineWidth = 1;
-    ctx.beginPath();
-    for (let k = 0; k < x.length; k++) {
-      const px = ax.x(x[k]), py = ax.y(y[k]);
-      const vx = dx[k] * ax.sx, vy = -dy[k] * ax.sy;
-      if (!Number.isFinite(vx + vy) || Math.hypot(vx, vy) < 1) continue;
-      ctx.moveTo(px, py);
-      ctx.lineTo(px + vx, py + vy);
-      ctx.lineTo(px + 0.7 * vx - 0.16 * vy, py + 0.7 * vy + 0.16 * vx);
-      ctx.moveTo(px + vx, py + vy);
-      ctx.lineTo(px + 0.7 * vx + 0.16 * vy, py + 0.7 * vy - 0.16 * vx);
-    }
-    ctx.stroke();
-  },
-
   band(ctx, ax, layer, get) {
     const x = get(layer.x), low = get(layer.y), high = get(layer.y2);
     ctx.globalAlpha = layer.alpha;
@@ -313,8 +296,8 @@ function drawCells(ctx, panel, layer, get, cursor, width, height) {
   const [rows, columns] = layer.values.shape.slice(-2);
   let values = get(layer.values);
   // One scale for all times, so that a color keeps its meaning while the time runs.
-  const limit = layer.limit
-    ?? values.reduce((a, v) => (Number.isFinite(v) ? Math.max(a, Math.abs(v)) : a), 1e-30);
+  const limit =
+    values.reduce((a, v) => (Number.isFinite(v) ? Math.max(a, Math.abs(v)) : a), 1e-30);
   if (layer.values.shape.length === 3) {
     const at = Math.min(cursor ?? layer.values.shape[0] - 1, layer.values.shape[0] - 1);
     values = values.subarray(at * rows * columns, (at + 1) * rows * columns);

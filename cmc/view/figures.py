@@ -2,79 +2,27 @@
 
 Every function draws into `ax` or, without one, into a new figure, and returns the figure; show it
 with `describe(fig, "what is to be seen")`. `labels` are those of the axes, with units; they and
-`title` may hold mathtext (`"$z_1$ (m)"`). `log` names the logarithmic axes: `""`, `"x"`, `"y"` or
-`"xy"`. Named lines have the color of their method (`METHOD_COLORS`), else the next of the cycle.
+`title` may hold mathtext (`"$z_1$ (m)"`). Named lines have the color of their method
+(`METHOD_COLORS`), else the next of the cycle.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from cmc.view.dynamics import (
-    convergence,
-    distances,
-    eigenvalues,
-    grid,
-    matrices,
-    matrix,
-    phase_portrait,
-    trajectories,
-)
-from cmc.view.style import (
-    BAD,
-    COLORS,
-    CYCLE,
-    GOOD,
-    METHOD_COLORS,
-    METHOD_TITLES,
-    NEUTRAL,
-    axes_or_new,
-    describe,
-    figure_of,
-    label,
-    looks,
-    panels,
-    save,
-    schematic,
-    use_style,
-)
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-__all__ = [
-    "BAD",
-    "COLORS",
-    "CYCLE",
-    "GOOD",
-    "METHOD_COLORS",
-    "METHOD_TITLES",
-    "NEUTRAL",
-    "convergence",
-    "curves",
-    "describe",
-    "distances",
-    "eigenvalues",
-    "grid",
-    "histogram",
-    "label",
-    "learning_curves",
-    "matrices",
-    "matrix",
-    "panels",
-    "phase_portrait",
-    "region",
-    "save",
-    "schematic",
-    "seed_dots",
-    "trajectories",
-    "use_style",
-]
+from cmc.view.style import BAD, GOOD, NEUTRAL, label, looks, panels
+from cmc.view.style import COLORS as COLORS
+from cmc.view.style import CYCLE as CYCLE
+from cmc.view.style import METHOD_COLORS as METHOD_COLORS
+from cmc.view.style import METHOD_TITLES as METHOD_TITLES
+from cmc.view.style import describe as describe
+from cmc.view.style import save as save
+from cmc.view.style import schematic as schematic
 
 
 def curves(
@@ -88,17 +36,98 @@ def curves(
     marks: Mapping[str, float] | None = None,
     ax: Axes | None = None,
 ) -> Figure:
-    """Draw named curves (points,) over one abscissa; `marks` names levels to mark."""
-    ax = axes_or_new(ax)
-    for (name, y), (color, style) in zip(lines.items(), _looks(lines, colors), strict=True):
+    """Draw named curves (points,) over one abscissa; `marks` names levels to mark.
+
+    `log` names the logarithmic axes: `""`, `"x"`, `"y"` or `"xy"`.
+    """
+    ax = _axes(ax)
+    for (name, y), (color, style) in zip(lines.items(), looks(lines, colors), strict=True):
         ax.plot(x, y, style, color=color, label=name)
     for name, level in (marks or {}).items():
         ax.axhline(level, color=NEUTRAL, ls="--", lw=1.2, label=name)
-    _logarithmic(ax, log)
-    if len(lines) + len(marks or {}) > 1:
-        ax.legend(loc="best")
-    label(ax, *labels, title)
-    return figure_of(ax)
+    ax.set(**{f"{axis}scale": "log" for axis in log})
+    return _finish(ax, labels, title, legend=len(lines) + len(marks or {}) > 1)
+
+
+def trajectories(
+    t: ArrayLike,
+    values: ArrayLike,
+    *,
+    color: str = GOOD,
+    name: str | None = None,
+    labels: tuple[str, str] = ("time (s)", "$y$"),
+    title: str | None = None,
+    target: float | None = None,
+    log: bool = False,
+    ax: Axes | None = None,
+) -> Figure:
+    """Draw one signal (time, number) or (time,) of trajectories; `target` is a level to mark.
+
+    On a logarithmic axis, what is below 1e-12 of the largest value is rounding, and left out.
+    """
+    ax, V = _axes(ax), np.asarray(values, float)
+    if log:
+        ax.set_yscale("log")
+        V = np.where(1e-12 * np.nanmax(V, initial=1e-300, where=np.isfinite(V)) < V, V, np.nan)
+    # the opacity at which many lines in one color still read as lines
+    alpha = float(np.clip(3.0 / max(np.size(V[0]), 1) ** 0.5, 0.25, 0.95))
+    lines = ax.plot(t, V, color=color, alpha=alpha, lw=1.3)
+    if name:
+        lines[0].set_label(name)
+    if target is not None:
+        ax.axhline(target, color=NEUTRAL, ls="--", lw=1.2, label="_")
+    return _finish(ax, labels, title, legend=bool(name))
+
+
+def matrix(
+    M: ArrayLike,
+    *,
+    block: int | None = None,
+    labels: Sequence[str] | None = None,
+    title: str | None = None,
+    ax: Axes | None = None,
+) -> Figure:
+    """Draw a matrix (rows, columns) as colored, written cells; entries that vanish are white.
+
+    Lines stand around blocks of size `block`; `labels` name the coordinates. An entry below 1e-9
+    of the largest counts as zero.
+    """
+    A = np.asarray(M, float)
+    if A.ndim != 2:
+        raise ValueError(f"wanted a matrix (rows, columns), got shape {A.shape}")
+    ax = _axes(ax, (0.75 * A.shape[1] + 1.4, 0.7 * A.shape[0] + 0.9))
+    largest = float(np.nanmax(np.abs(A), initial=0.0)) or 1.0
+    shown = np.where(np.abs(A) <= 1e-9 * largest, 0.0, A)
+    ax.imshow(shown, cmap="PuOr", vmin=-1.6 * largest, vmax=1.6 * largest, aspect="equal")
+    for (i, j), value in np.ndenumerate(shown):
+        text, color = ("0", "#AAAAAA") if value == 0 else (f"{value:.2g}", "#111111")
+        ax.text(j, i, text, ha="center", va="center", color=color)
+    ax.grid(visible=False)
+    ax.spines[:].set_visible(False)
+    ax.tick_params(length=0)
+    for axis, size in ((ax.xaxis, A.shape[1]), (ax.yaxis, A.shape[0])):
+        axis.set_ticks(range(size), labels=list(labels)[:size] if labels else [""] * size)
+    ax.xaxis.tick_top()
+    for edge in range(0, max(A.shape) + 1, block) if block else ():
+        ax.axhline(edge - 0.5, color="#333333", lw=1.4)
+        ax.axvline(edge - 0.5, color="#333333", lw=1.4)
+    ax.set_title(title or "", pad=10)
+    return ax.get_figure(root=True)  # type: ignore[return-value]
+
+
+def matrices(
+    named: Mapping[str, ArrayLike], *, block: int | None = None, labels: Sequence[str] | None = None
+) -> Figure:
+    """Draw several matrices side by side, each under its name; `block`, `labels` as in `matrix`."""
+    if not named:
+        raise ValueError("wanted at least one matrix, got none")
+    widths = [np.shape(M)[1] + 0.8 for M in named.values()]
+    height = 0.6 * max(np.shape(M)[0] for M in named.values()) + 0.9
+    size = {"width": min(0.72 * sum(widths), 12.0), "height": height}
+    fig, axes = panels(1, len(named), width_ratios=widths, **size)
+    for ax, (name, M) in zip(axes[0], named.items(), strict=True):
+        matrix(M, block=block, labels=labels, title=name, ax=ax)
+    return fig
 
 
 def histogram(
@@ -106,57 +135,21 @@ def histogram(
     *,
     label_x: str,
     bins: int | ArrayLike = 40,
-    log: bool = False,
     colors: Sequence[str] | None = None,
-    title: str | None = None,
     ax: Axes | None = None,
 ) -> Figure:
     """Draw the shares of named samples over common bins (a number, or edges), as outlines.
 
     Samples outside of the bins are counted in the outermost bins, so that nothing is hidden.
     """
-    ax = axes_or_new(ax)
+    ax = _axes(ax)
     flat = {name: np.ravel(np.asarray(x, float)) for name, x in samples.items()}
     edges = np.histogram_bin_edges(np.concatenate(list(flat.values())), bins)
-    for (name, x), (color, style) in zip(flat.items(), _looks(flat, colors), strict=True):
+    for (name, x), (color, style) in zip(flat.items(), looks(flat, colors), strict=True):
         share = np.histogram(np.clip(x, edges[0], edges[-1]), edges)[0] / max(x.size, 1)
         ax.stairs(share, edges, color=color, fill=True, alpha=0.25)
         ax.stairs(share, edges, color=color, ls=style, lw=1.8, label=name)
-    _logarithmic(ax, "y" if log else "")
-    if len(flat) > 1:
-        ax.legend(loc="best")
-    label(ax, label_x, "share of samples", title)
-    return figure_of(ax)
-
-
-def learning_curves(
-    steps: ArrayLike,
-    runs: Mapping[str, ArrayLike],
-    *,
-    labels: tuple[str, str] = ("environment steps", "return"),
-    each_seed: bool = True,
-    colors: Sequence[str] | None = None,
-    title: str | None = None,
-    ax: Axes | None = None,
-) -> Figure:
-    """Draw medians over seeds of named runs (seeds, points), their range, and thin single seeds."""
-    ax = axes_or_new(ax)
-    x = np.asarray(steps, float)
-    for (name, values), (color, style) in zip(runs.items(), _looks(runs, colors), strict=True):
-        Y = np.atleast_2d(np.asarray(values, float))
-        if Y.shape[-1] != x.size:
-            raise ValueError(f"{name}: wanted (seeds, {x.size}) values, got shape {Y.shape}")
-        seeds = f" ({Y.shape[0]} seeds)" if Y.shape[0] > 1 else ""
-        median = np.nanmedian(Y, axis=0)
-        ax.plot(x, median, style, color=color, lw=2.2, label=f"{name}{seeds}")
-        if Y.shape[0] > 1:
-            low, high = np.nanmin(Y, axis=0), np.nanmax(Y, axis=0)
-            ax.fill_between(x, low, high, color=color, alpha=0.15, lw=0)
-            if each_seed:
-                ax.plot(x, Y.T, color=color, lw=0.7, alpha=0.5)
-    ax.legend(loc="best")
-    label(ax, *labels, title)
-    return figure_of(ax)
+    return _finish(ax, (label_x, "share of samples"), legend=len(flat) > 1)
 
 
 def region(
@@ -166,7 +159,6 @@ def region(
     *,
     labels: tuple[str, str, str],
     level: float | None = 0.0,
-    log: str = "",
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Figure:
@@ -177,56 +169,26 @@ def region(
     V = np.asarray(values, float)
     if V.shape != (np.size(y), np.size(x)):
         raise ValueError(f"wanted values ({np.size(y)}, {np.size(x)}), got shape {V.shape}")
-    ax = axes_or_new(ax, (6.4, 4.2))
+    ax = _axes(ax, (6.4, 4.2))
     mesh = ax.pcolormesh(x, y, V, shading="nearest", cmap="cividis")
     if level is not None and np.nanmin(V) < level < np.nanmax(V):
         ax.contour(x, y, V, levels=[level], colors=[BAD], linewidths=2)
-    _logarithmic(ax, log)
     ax.grid(visible=False)
-    figure_of(ax).colorbar(mesh, ax=ax, label=labels[2])
-    label(ax, labels[0], labels[1], title)
-    return figure_of(ax)
+    fig = _finish(ax, labels[:2], title)
+    fig.colorbar(mesh, ax=ax, label=labels[2])
+    return fig
 
 
-def seed_dots(
-    groups: Mapping[str, ArrayLike],
-    *,
-    label_x: str,
-    xlim: tuple[float, float] | None = None,
-    marks: Sequence[float] = (),
-    title: str | None = None,
-    ax: Axes | None = None,
+def _axes(ax: Axes | None, size: tuple[float, float] = (7.0, 3.6)) -> Axes:
+    """`ax`, or the axes of a new figure of a size in inches."""
+    return panels(width=size[0], height=size[1])[1][0, 0] if ax is None else ax
+
+
+def _finish(
+    ax: Axes, labels: tuple[str, str], title: str | None = None, *, legend: bool = False
 ) -> Figure:
-    """Draw a row for each group (seeds,), the first on top: dots, the mean, the range.
-
-    Dots of equal value are moved apart, so that each can be counted; `marks` are vertical lines.
-    """
-    ax = axes_or_new(ax, (7.0, 0.9 + 0.42 * max(len(groups), 1)))
-    for row, (values, (color, _)) in enumerate(zip(groups.values(), looks(groups), strict=True)):
-        x = np.sort(np.asarray(values, float))
-        ax.plot([x[0], x[-1]], [row, row], color=color, lw=1.5, alpha=0.5)
-        ax.plot([x.mean()] * 2, [row - 0.3, row + 0.3], color=color, lw=2.5)
-        ax.plot(x, row + 0.22 * np.linspace(-1, 1, x.size), "o", color=color, ms=5, alpha=0.8)
-    for mark in marks:
-        ax.axvline(mark, color=NEUTRAL, ls="--", lw=1.2)
-    ax.set_yticks(range(len(groups)), list(groups))
-    ax.set_ylim(len(groups) - 0.4, -0.6)
-    if xlim is not None:
-        ax.set_xlim(*xlim)
-    label(ax, label_x, "", title)
-    return figure_of(ax)
-
-
-def _looks(names: Iterable[str], colors: Sequence[str] | None) -> list[tuple[str, str]]:
-    """A color and a line style for each name; given colors are dashed from the second round on."""
-    if colors is None:
-        return looks(names)
-    styles = ("-", "--", "-.", ":")
-    return [(colors[k % len(colors)], styles[k // len(colors) % 4]) for k, _ in enumerate(names)]
-
-
-def _logarithmic(ax: Axes, log: str) -> None:
-    if "x" in log:
-        ax.set_xscale("log")
-    if "y" in log:
-        ax.set_yscale("log")
+    """Label the axes, and return the figure that they lie in."""
+    if legend:
+        ax.legend(loc="best")
+    label(ax, *labels, title)
+    return ax.get_figure(root=True)  # type: ignore[return-value]

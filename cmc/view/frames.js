@@ -1,4 +1,4 @@
-// Sliders without a kernel: pictures from the table of cmc.view.frames, or a word that there are none.
+// Sliders without a kernel: pictures from the table of cmc.view.canvas, or a word that there are none.
 // canvas.js follows in the same module.
 
 const EXACT = 64, CODES = 65532;

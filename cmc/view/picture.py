@@ -1,41 +1,149 @@
 """What a live picture is made of: panels of layers, encoded as frames.
 
-`encode` turns panels and the mapping that a callback returned into one frame: a JSON-able layout
-and one block of float32 bytes, which `canvas.js` draws.
+A layer names its data by keys of the mapping that a callback returns, or holds arrays itself:
+`lines("t", "y")`, `points("eigenvalues")`, `rule(y=0)`. Its color is a name of `style.COLORS` or
+hexadecimal, by default the next of the cycle. `encode` turns panels and a callback's mapping into
+one frame: a JSON-able layout and one block of float32 bytes, which `canvas.js` draws.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from cmc.view.layers import Buffer, Data, Layer, PictureError, Source, get_array
-from cmc.view.style import CYCLE
+from cmc.view.style import COLORS, CYCLE, NEUTRAL
+
+Data = Mapping[str, Any]
+Source = str | ArrayLike
+"""A key of the callback's result, or the array itself."""
+
+_Arrays = dict[str, np.ndarray]
+_CURVE = ("label", "width", "alpha", "dash", "head")
+
+
+class PictureError(ValueError):
+    """Data that a layer cannot draw: an absent key, or an array of another shape."""
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """One thing that a panel draws: how to fetch its data, and how it looks."""
+
+    kind: str
+    fetch: Callable[[Data], _Arrays]
+    look: dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Panel:
     """Axes with layers; made by `panel`."""
 
-    layers: tuple[Layer, ...]
+    layers: tuple[_Layer, ...]
     look: dict[str, Any]
 
-    def encode(self, data: Data, buffer: Buffer) -> dict[str, Any]:
-        """Return the panel's layout, with titles filled in and limits found."""
-        made = [layer.encode(data, buffer) for layer in self.layers]
-        look = dict(self.look)
-        look["title"] = fill(look["title"], data)
-        for k, axis in enumerate(("xlim", "ylim")):
-            extents = [e[k] for _, e in made if len(e) == 2]
-            look[axis] = list(look[axis] or limits(extents, log=bool(look["log"]) and k == 1))
-        return {**look, "layers": [layout for layout, _ in made]}
+
+def lines(x: Source, y: Source, *, color: str | None = None, **look: Any) -> _Layer:
+    """Curves over a common abscissa: x (m,), y (m,) or (m, number).
+
+    `look`: `label`, `width` (px), `alpha`, `dash` (bool), `head` (bool: dots at the time cursor).
+    """
+
+    def arrange(X: np.ndarray, Y: np.ndarray) -> _Arrays | None:
+        Y = Y[:, None] if Y.ndim == 1 else Y
+        return {"x": X, "y": Y.T} if X.ndim == 1 and Y.ndim == 2 and len(X) == len(Y) else None
+
+    fetch = _fetch("lines", arrange, (x, y), "(m,) and (m, number)")
+    return _Layer("lines", fetch, _look(color, look, *_CURVE))
+
+
+def paths(p: Source, *, color: str | None = None, **look: Any) -> _Layer:
+    """Curves in a plane: (time, number, 2), or (time, 2); further coordinates are not drawn.
+
+    `look` as in `lines`; `head` is true by default.
+    """
+
+    def arrange(P: np.ndarray) -> _Arrays | None:
+        P = P[:, None] if P.ndim == 2 else P
+        flat = P.ndim == 3 and P.shape[-1] >= 2
+        return {"x": P[..., 0].T, "y": P[..., 1].T} if flat else None
+
+    fetch = _fetch("paths", arrange, (p,), "(time, number, 2)")
+    return _Layer("lines", fetch, _look(color, {"head": True, **look}, *_CURVE))
+
+
+def points(p: Source, *, color: str | None = None, **look: Any) -> _Layer:
+    """Dots: complex numbers (any shape), or (number, 2), or (time, number, 2) for the time cursor.
+
+    `look`: `label`, `radius` (px), `alpha`, `marker` (`"dot"`, `"cross"` or `"ring"`).
+    """
+
+    def arrange(P: np.ndarray) -> _Arrays | None:
+        if np.iscomplexobj(P):
+            P = np.stack([P.real.ravel(), P.imag.ravel()], axis=-1)
+        flat = P.ndim in (2, 3) and P.shape[-1] == 2
+        return {"x": P[..., 0], "y": P[..., 1]} if flat else None
+
+    fetch = _fetch("points", arrange, (p,), "complex numbers or (number, 2)")
+    return _Layer("points", fetch, _look(color, look, "label", "radius", "alpha", "marker"))
+
+
+def band(x: Source, low: Source, high: Source, *, color: str | None = None, **look: Any) -> _Layer:
+    """A filled band between two curves, each (m,); `look`: `label`, `alpha`."""
+
+    def arrange(X: np.ndarray, L: np.ndarray, H: np.ndarray) -> _Arrays | None:
+        return {"x": X, "y": L, "y2": H} if (len(X),) == X.shape == L.shape == H.shape else None
+
+    fetch = _fetch("band", arrange, (x, low, high), "(m,) thrice")
+    return _Layer("band", fetch, _look(color, {"alpha": 0.2, **look}, "label", "alpha"))
+
+
+def cells(M: Source) -> _Layer:
+    """A matrix as colored, written cells: (rows, columns), or (time, rows, columns).
+
+    Put it alone in a panel. NaN is an empty cell; the largest entry has the strongest color.
+    """
+
+    def arrange(A: np.ndarray) -> _Arrays | None:
+        if A.ndim not in (2, 3):
+            return None
+        rows, columns = A.shape[-2:]
+        corners = {"x": np.array([0.5, columns + 0.5]), "y": np.array([0.5, rows + 0.5])}
+        return {"values": A, **corners}
+
+    return _Layer("cells", _fetch("cells", arrange, (M,), "(rows, columns)"), {})
+
+
+def shade(
+    *, x: tuple[float, float] | None = None, y: tuple[float, float] | None = None, **look: Any
+) -> _Layer:
+    """A shaded strip between two abscissas or two ordinates (`-inf` and `inf` reach the edge).
+
+    `look`: `color`, `label`, `alpha`.
+    """
+    axis, strip = _one(x=x, y=y)
+    span = [None if np.isinf(v) else float(v) for v in strip]
+    made = _look(look.pop("color", "blue"), {"alpha": 0.1, **look}, "label", "alpha")
+    return _Layer("shade", lambda data: {}, {**made, "axis": axis, "span": span})
+
+
+def rule(*, x: float | str | None = None, y: float | str | None = None, **look: Any) -> _Layer:
+    """A straight line across the panel at an abscissa or an ordinate (a number or a key).
+
+    `look`: `color`, `label`, `dash` (bool), `width` (px).
+    """
+    axis, where = _one(x=x, y=y)
+    fetch = _fetch("rule", lambda v: {"value": np.ravel(v)[:1]}, (where,), "a number")
+    made = _look(look.pop("color", NEUTRAL), {"dash": True, **look}, "label", "dash", "width")
+    return _Layer("rule", fetch, {**made, "axis": axis})
 
 
 def panel(
-    *layers: Layer,
+    *layers: _Layer,
     x: str,
     y: str,
     title: str = "",
@@ -47,58 +155,67 @@ def panel(
 ) -> Panel:
     """Axes that hold layers; the first layers lie lowest.
 
-    Args:
-        layers: what to draw.
-        x: label of the horizontal axis with its unit; `$y_1$` and the like are typeset.
-        y: label of the vertical axis with its unit.
-        title: title; `{key}` is filled from the callback's result, `{rate:.2f}` formatted.
-        xlim: limits of the horizontal axis; from the data by default, so that it may jump.
-        ylim: limits of the vertical axis.
-        equal: one unit is equally long along both axes.
-        log: the vertical axis is logarithmic.
-        size: width and height in CSS pixels.
+    `x` and `y` label the axes with their units (`$y_1$` and the like are typeset); `{key}` in the
+    title is filled from the callback's result, `{rate:.2f}` formatted. Without limits an axis
+    follows the data, and may jump. `equal`: one unit is equally long along both axes; `log`: the
+    vertical axis is logarithmic; `size` in CSS pixels.
     """
     if not layers:
         raise PictureError("wanted at least one layer in the panel")
-    colored = []
-    cycle = iter(list(CYCLE) * 4)
-    for layer in layers:
-        look = dict(layer.look)
-        if "color" in look and look["color"] is None:
-            look["color"] = next(cycle)
-        colored.append(Layer(layer.kind, layer.fetch, look))
     for name, given in (("xlim", xlim), ("ylim", ylim)):
         if given is not None and not (np.isfinite(given).all() and given[0] < given[1]):
             raise PictureError(f"{name}: wanted two finite rising numbers, got {given}")
+    cycle = itertools.cycle(CYCLE)
+    colored = [
+        replace(layer, look={**layer.look, "color": next(cycle)})
+        if layer.look.get("color", "") is None
+        else layer
+        for layer in layers
+    ]
     look = {"x": x, "y": y, "title": title, "xlim": xlim, "ylim": ylim}
     return Panel(tuple(colored), {**look, "equal": equal, "log": log, "size": list(size)})
 
 
 def encode(panels: Sequence[Panel], data: Data, time: Source | None = None) -> dict[str, Any]:
-    """Return one frame: layout of the panels, the status line, the times, and the bytes.
+    """One frame: layout of the panels, the status line, the times (m,), s, and the bytes.
 
-    Args:
-        panels: the panels.
-        data: what the callback returned; its entry `text`, if any, is shown as a status line.
-        time: times (m,) of the time cursor, s; no cursor without them.
+    The entry `text` of `data`, if any, is the status line; `time` is that of the time cursor.
 
     Raises:
         PictureError: if a key is absent or an array has another shape than its layer wants.
     """
     if not isinstance(data, Mapping):
         raise PictureError(f"wanted a mapping of names to arrays, got {type(data).__name__}")
-    buffer = Buffer()
-    frame: dict[str, Any] = {"panels": [panel.encode(data, buffer) for panel in panels]}
+    blocks: list[np.ndarray] = []
+
+    def put(array: np.ndarray) -> dict[str, Any]:
+        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite: a gap
+            blocks.append(np.ascontiguousarray(array, dtype=np.float32))
+        return {"at": sum(b.size for b in blocks[:-1]), "shape": list(array.shape)}
+
+    frame: dict[str, Any] = {"panels": [_lay_out(panel, data, put) for panel in panels]}
     frame["text"] = str(data.get("text", ""))
-    frame["time"] = None
-    if time is not None:
-        t = get_array(data, time)
-        frame["time"] = {"at": buffer.add(t), "shape": list(t.shape)}
-    frame["data"] = buffer.tobytes()
-    return frame
+    frame["time"] = None if time is None else put(_array(data, time))
+    return {**frame, "data": b"".join(block.tobytes() for block in blocks)}
 
 
-def limits(extents: Sequence[np.ndarray], *, log: bool) -> tuple[float, float]:
+def _lay_out(panel: Panel, data: Data, put: Callable[[np.ndarray], Any]) -> dict[str, Any]:
+    """A panel's layout, with titles filled in, limits found and arrays put into the frame."""
+    made = [layer.fetch(data) for layer in panel.layers]
+    look = {**panel.look, "title": _fill(panel.look["title"], data)}
+    for limit, names in (("xlim", ("x",)), ("ylim", ("y", "y2"))):
+        if look[limit] is None:
+            extents = [arrays[name] for arrays in made for name in names if name in arrays]
+            look[limit] = _limits(extents, log=look["log"] and limit == "ylim")
+        look[limit] = list(look[limit])
+    look["layers"] = [
+        {"kind": layer.kind, **layer.look, **{name: put(array) for name, array in arrays.items()}}
+        for layer, arrays in zip(panel.layers, made, strict=True)
+    ]
+    return look
+
+
+def _limits(extents: Sequence[np.ndarray], *, log: bool) -> tuple[float, float]:
     """Limits that hold all finite values (positive ones on a logarithmic axis), with a margin."""
     values = np.concatenate([np.ravel(e) for e in extents]) if extents else np.zeros(0)
     values = values[np.isfinite(values) & ((values > 0) | (not log))]
@@ -106,23 +223,17 @@ def limits(extents: Sequence[np.ndarray], *, log: bool) -> tuple[float, float]:
         return (0.1, 1.0) if log else (0.0, 1.0)
     low, high = float(values.min()), float(values.max())
     if log:
-        low = max(low, high * 1e-12)
-        return low / 1.5, high * 1.5
+        return max(low, high * 1e-12) / 1.5, high * 1.5
     margin = 0.05 * (high - low) or 0.5 * abs(high) or 0.5
     return low - margin, high + margin
 
 
-def fill(text: str, data: Data) -> str:
+def _fill(text: str, data: Data) -> str:
     """Fill `{key}` fields of a title, outside of `$...$`, from the numbers and words of `data`."""
     parts = text.split("$")  # every second part is mathematics, whose braces are its own
     if not any("{" in part for part in parts[::2]):
         return text
-    plain = {
-        key: value.item()
-        if isinstance(value, np.ndarray | np.generic) and value.size == 1
-        else value
-        for key, value in data.items()
-    }
+    plain = {key: v.item() if getattr(v, "size", 0) == 1 else v for key, v in data.items()}
     try:
         parts[::2] = [part.format(**plain) for part in parts[::2]]
     except (KeyError, IndexError, ValueError, TypeError) as error:
@@ -130,3 +241,51 @@ def fill(text: str, data: Data) -> str:
             f"cannot fill the title {text!r} from {sorted(data)}: {error}"
         ) from error
     return "$".join(parts)
+
+
+def _fetch(
+    name: str, arrange: Callable[..., _Arrays | None], sources: tuple[Source, ...], wanted: str
+) -> Callable[[Data], _Arrays]:
+    """What reads the sources and arranges them, or says which shapes were wanted and came."""
+
+    def fetch(data: Data) -> _Arrays:
+        arrays = [_array(data, source, complex_too=name == "points") for source in sources]
+        made = arrange(*arrays)
+        if made is None:
+            came = " and ".join(str(array.shape) for array in arrays)
+            given = ", ".join(map(_name, sources))
+            raise PictureError(f"{name}({given}): wanted {wanted}, got {came}")
+        return made
+
+    return fetch
+
+
+def _array(data: Data, source: Source, *, complex_too: bool = False) -> np.ndarray:
+    """The numbers that `source` names in `data`, or holds itself, as floats."""
+    if isinstance(source, str) and source not in data:
+        raise PictureError(f"the callback returned no {source!r}, only {sorted(data)}")
+    array = np.asarray(data[source] if isinstance(source, str) else source)
+    if array.dtype.kind not in "biuf" + "c" * complex_too or array.size == 0:
+        raise PictureError(
+            f"{_name(source)}: wanted numbers, got {array.dtype} of shape {array.shape}"
+        )
+    return array if array.dtype.kind == "c" else array.astype(float)
+
+
+def _one(**given: Any) -> tuple[str, Any]:
+    """The one axis that is given, and what."""
+    found = [(axis, value) for axis, value in given.items() if value is not None]
+    if len(found) != 1:
+        raise PictureError(f"wanted x=... or y=..., got {given}")
+    return found[0]
+
+
+def _name(source: Source) -> str:
+    return repr(source) if isinstance(source, str) else "array"
+
+
+def _look(color: str | None, look: dict[str, Any], *known: str) -> dict[str, Any]:
+    unknown = set(look) - set(known)
+    if unknown:
+        raise TypeError(f"unknown look {sorted(unknown)}; there are: {sorted(known)}")
+    return {**look, "color": COLORS.get(color, color) if color else None}

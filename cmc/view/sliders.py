@@ -23,83 +23,148 @@ import itertools
 import os
 import traceback
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import ipywidgets as widgets
 import numpy as np
 
-from cmc.view.canvas import Canvas, LiveCurve
-from cmc.view.controls import Choice, Control, Slider, choice, slider, toggle
-from cmc.view.frames import frame_table
-from cmc.view.layers import Source, arrows, band, cells, lines, paths, points, rule, shade
-from cmc.view.picture import Panel, panel
-
-__all__ = [
-    "Choice",
-    "Explorer",
-    "LiveCurve",
-    "Slider",
-    "arrows",
-    "band",
-    "cells",
-    "choice",
-    "explore",
-    "lines",
-    "panel",
-    "paths",
-    "points",
-    "rule",
-    "shade",
-    "slider",
-    "toggle",
-]
+from cmc.view.canvas import Canvas, frame_table
+from cmc.view.canvas import LiveCurve as LiveCurve
+from cmc.view.picture import Panel, Source, encode
+from cmc.view.picture import band as band
+from cmc.view.picture import cells as cells
+from cmc.view.picture import lines as lines
+from cmc.view.picture import panel as panel
+from cmc.view.picture import paths as paths
+from cmc.view.picture import points as points
+from cmc.view.picture import rule as rule
+from cmc.view.picture import shade as shade
 
 _DEBOUNCE = 0.004  # s: changes that wait in the kernel's queue are answered by one frame
 
 
-class Explorer(widgets.VBox):
-    """Controls above a canvas that follows them; made by `explore`.
+@dataclass(frozen=True)
+class Control:
+    """What moves a picture; made by `slider`, `choice` or `toggle`.
 
-    Attributes:
-        canvas: the picture.
-        controls: name to ipywidgets control.
-        errors: one text for each time the callback failed after the first picture.
+    `values` are all that it can have, in order.
+    """
+
+    kind: type[widgets.ValueWidget]
+    start: Any
+    values: list[Any]
+    label: str
+    unit: str = ""
+    more: dict[str, Any] = field(default_factory=dict)
+
+    def widget(self, name: str, *, slow: bool) -> widgets.ValueWidget:
+        """The control, under its label and unit."""
+        slides = {"continuous_update": not slow} if self.is_slider else {}
+        return self.kind(
+            value=self.start,
+            description=(self.label or name) + (f" ({self.unit})" if self.unit else ""),
+            style={"description_width": "initial"},
+            layout={"width": "28em"},
+            **slides,
+            **self.more,
+        )
+
+    @property
+    def is_slider(self) -> bool:
+        """Whether a number moves between two ends."""
+        return self.kind in (widgets.IntSlider, widgets.FloatSlider)
+
+    @property
+    def probes(self) -> list[Any]:
+        """Values that the callback must survive: the ends of a slider, or all."""
+        return [self.values[0], self.values[-1]] if self.is_slider else self.values
+
+
+def slider(
+    low: float,
+    high: float,
+    start: float | None = None,
+    *,
+    step: float | None = None,
+    label: str = "",
+    unit: str = "",
+) -> Control:
+    """A slider from `low` to `high` that begins at `start` (the middle by default).
+
+    `step` is what an arrow key adds: 1, or a hundredth of the range. Whole numbers throughout make
+    an integer slider.
+
+    Raises:
+        ValueError: if the numbers are not finite or not in order.
+    """
+    whole = isinstance(low, int) and isinstance(high, int) and isinstance(start, int | None)
+    if step is None:
+        step = 1 if whole else (high - low) / 100
+    if start is None:
+        start = (low + high) // 2 if whole else (low + high) / 2
+    if not (np.isfinite([low, high, start, step]).all() and low <= start <= high and low < high):
+        raise ValueError(f"wanted finite low <= start <= high, got {low}, {start}, {high}")
+    if not 0 < step <= high - low:
+        raise ValueError(f"wanted 0 < step <= {high - low}, got {step}")
+    if not whole or not isinstance(step, int):
+        whole, low, high, start, step = False, float(low), float(high), float(start), float(step)
+    count = int(np.ceil((high - low) / step - 1e-9)) + 1
+    steps = {min(low + k * step, high) for k in range(count)}
+    near = {v for v in steps if abs(v - start) < 1e-9 * (high - low)}
+    digits = max(0, int(np.ceil(-np.log10(step) - 1e-9)))
+    more: dict[str, Any] = {"min": low, "max": high, "step": step}
+    more["readout_format"] = "d" if whole else f".{digits}f"
+    kind = widgets.IntSlider if whole else widgets.FloatSlider
+    return Control(kind, start, sorted(steps - near | {start}), label, unit, more)
+
+
+def choice(*options: Any, start: Any = None, label: str = "") -> Control:
+    """A list to choose one of `options` from; the first one by default."""
+    if len(options) < 2:
+        raise ValueError(f"wanted at least two options, got {options}")
+    start = options[0] if start is None else start
+    if start not in options:
+        raise ValueError(f"wanted a start among {options}, got {start!r}")
+    return Control(widgets.Dropdown, start, list(options), label, more={"options": options})
+
+
+def toggle(start: bool = False, *, label: str = "") -> Control:
+    """A check box."""
+    return Control(widgets.Checkbox, start, [False, True], label, more={"indent": True})
+
+
+class Explorer(widgets.VBox):
+    """Controls (by name) above a canvas that follows them; made by `explore`.
+
+    `errors` holds one text for each time the callback failed after the first picture.
     """
 
     def __init__(
         self,
         callback: Callable[..., Mapping[str, Any]],
-        panels: tuple[Panel, ...],
+        canvas: Canvas,
         controls: Mapping[str, Control],
-        describe: str,
-        time: Source | None = None,
-        slow: bool = False,
-        frames: bool = False,
+        slow: bool,
     ) -> None:
-        if not controls:
-            raise ValueError("wanted at least one slider")
-        self.callback = callback
+        self.callback, self.canvas = callback, canvas
         self.errors: list[str] = []
         self._wanted: asyncio.TimerHandle | None = None
         self.controls = {name: c.widget(name, slow=slow) for name, c in controls.items()}
-        self.canvas = Canvas(panels, describe, time)
-        for values in probes(controls, corners=not slow):
+        for values in _probes(controls, corners=not slow):
             self.evaluate(**values)  # raises: a broken callback fails the cell
-        self._reset = widgets.Button(
+        button = widgets.Button(
             description="Reset", tooltip="back to the first values", layout={"width": "6em"}
         )
-        self._reset.on_click(lambda _: self.reset())
-        self._first = {name: widget.value for name, widget in self.controls.items()}
+        self._first = self.values
+        button.on_click(lambda _: self.reset())
         for widget in self.controls.values():
             widget.observe(self._changed, "value")
-        row = widgets.Box([*self.controls.values(), self._reset], layout={"flex_flow": "row wrap"})
+        row = widgets.Box([*self.controls.values(), button], layout={"flex_flow": "row wrap"})
         super().__init__([row, self.canvas])
         # What the page needs to go on without a kernel, or to say that it cannot.
-        self.canvas.controls = [widget.model_id for widget in self.controls.values()]
-        kinds = controls.values()
-        self.canvas.values = [c.values if isinstance(c, Slider) else None for c in kinds]
-        if frames:
-            self.canvas.table = self._table(controls)
+        canvas.controls = [widget.model_id for widget in self.controls.values()]
+        canvas.values = [c.values if c.is_slider else None for c in controls.values()]
 
     @property
     def values(self) -> dict[str, Any]:
@@ -107,29 +172,10 @@ class Explorer(widgets.VBox):
         return {name: widget.value for name, widget in self.controls.items()}
 
     def evaluate(self, **values: Any) -> Mapping[str, Any]:
-        """Call the callback with the controls' values, replaced by `values`, and show the result.
-
-        Raises:
-            Exception: whatever the callback raises.
-            PictureError: if its arrays do not fit the layers.
-        """
+        """Show what the callback makes of the controls' values, replaced by `values`."""
         data = self.callback(**{**self.values, **values})
         self.canvas.show(data)
         return data
-
-    def _table(self, controls: Mapping[str, Control]) -> dict[str, Any]:
-        """Pictures for all positions of the controls; those that fail hold the error."""
-        values = [control.values for control in controls.values()]
-        starts = [v.index(c.start) for v, c in zip(values, controls.values(), strict=True)]
-
-        def picture(*index: int) -> dict[str, Any]:
-            chosen = {name: v[k] for name, v, k in zip(controls, values, index, strict=True)}
-            try:
-                return self.canvas.encode(self.callback(**chosen))
-            except Exception as error:
-                return {"error": "".join(traceback.format_exception_only(error)).strip()}
-
-        return frame_table(values, starts, picture)
 
     def reset(self) -> None:
         """Move every control back to its first value."""
@@ -152,10 +198,9 @@ class Explorer(widgets.VBox):
             self.evaluate()
         except Exception as error:
             # A handler's exception would reach nobody: it is shown and kept instead.
-            said = "".join(traceback.format_exception_only(error)).strip()
             at = ", ".join(f"{name} = {value}" for name, value in values.items())
-            self.errors.append(f"{said} (at {at})")
-            self.canvas.fail(self.errors[-1])
+            self.errors.append(f"{_said(error)} (at {at})")
+            self.canvas.error = self.errors[-1]
 
 
 def explore(
@@ -180,17 +225,30 @@ def explore(
         time: key of the times (m,), s, of a time cursor: layers with `head` and dots or cells of
             shape (time, ...) follow it, and a button plays the motion.
         slow: answer only when a slider is released, and try fewer values at first.
-        frames: also make the pictures of all positions of the controls (`frames.py`), so that
-            exported HTML, a static site and a reopened notebook are live without a kernel; only
-            where the environment variable CMC_EXPORT is 1 by default, as it takes its time.
+        frames: also make the pictures of all positions of the controls, so that exported HTML, a
+            static site and a reopened notebook are live without a kernel; by default only where the
+            environment variable CMC_EXPORT is 1, as it takes its time.
         controls: parameter name to `slider`, `choice` or `toggle`.
     """
-    if frames is None:
-        frames = os.environ.get("CMC_EXPORT", "0") not in ("", "0")
-    return Explorer(callback, panels, controls, describe, time, slow, frames)
+    if not controls:
+        raise ValueError("wanted at least one slider")
+    canvas = Canvas(panels, describe, time)
+    made = Explorer(callback, canvas, controls, slow)
+    if os.environ.get("CMC_EXPORT", "0") not in ("", "0") if frames is None else frames:
+        starts = [c.values.index(c.start) for c in controls.values()]
+
+        def picture(*values: Any) -> dict[str, Any]:
+            try:
+                data = callback(**dict(zip(controls, values, strict=True)))
+                return encode(panels, data, time)
+            except Exception as error:
+                return {"error": _said(error)}
+
+        canvas.table = frame_table([c.values for c in controls.values()], starts, picture)
+    return made
 
 
-def probes(controls: Mapping[str, Control], *, corners: bool) -> Iterator[dict[str, Any]]:
+def _probes(controls: Mapping[str, Control], *, corners: bool) -> Iterator[dict[str, Any]]:
     """Values to try a callback with: each end alone, corners of up to three controls, the start.
 
     The start comes last, so that its picture is the one that stays.
@@ -203,3 +261,7 @@ def probes(controls: Mapping[str, Control], *, corners: bool) -> Iterator[dict[s
         for ends in itertools.product(*(c.probes for c in controls.values())):
             yield dict(zip(controls, ends, strict=True))
     yield start
+
+
+def _said(error: Exception) -> str:
+    return "".join(traceback.format_exception_only(error)).strip()

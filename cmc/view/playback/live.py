@@ -10,12 +10,10 @@ cannot reach it: there the file is the way.
 from __future__ import annotations
 
 import asyncio
-import atexit
 import contextlib
 import threading
 from typing import Any
 
-import meshcat
 import mujoco
 import numpy as np
 import tornado.httpserver
@@ -25,14 +23,12 @@ import tornado.websocket
 import umsgpack
 from IPython.display import IFrame, display
 
-from cmc.view.playback.geometry import transform
 from cmc.view.playback.page import page
-from cmc.view.playback.scene import Scene, body_paths
+from cmc.view.playback.shapes import body_paths, transform
 
-HOST = "127.0.0.1"
+_HOST = "127.0.0.1"
 _FLUSH = 1 / 60  # seconds between two sendings of what has moved
-_PATIENCE = 10.0  # seconds after which a browser that reads nothing is dropped
-_FRAMED_BY = f"frame-ancestors http://{HOST}:* http://localhost:* https://localhost:*"
+_FRAMED_BY = f"frame-ancestors http://{_HOST}:* http://localhost:* https://localhost:*"
 
 
 class _Door(tornado.web.RequestHandler):
@@ -41,7 +37,7 @@ class _Door(tornado.web.RequestHandler):
 
     def prepare(self) -> None:
         # A page elsewhere may point its own host name at 127.0.0.1; only these names are served.
-        if self.request.host_name not in (HOST, "localhost"):
+        if self.request.host_name not in (_HOST, "localhost"):
             raise tornado.web.HTTPError(403)
         self.view.touch()
 
@@ -63,16 +59,17 @@ class _Socket(_Door, tornado.websocket.WebSocketHandler):
 
     async def _write(self) -> None:
         """Send what waits; of many poses of a body, only the newest travels."""
-        try:
+        with contextlib.suppress(tornado.websocket.WebSocketClosedError):
             while True:
                 waiting, self.waiting = self.waiting, {}
                 for data in waiting.values():
-                    await asyncio.wait_for(self.write_message(data, binary=True), _PATIENCE)
+                    await self.write_message(data, binary=True)
                 await asyncio.sleep(_FLUSH)
-        except (TimeoutError, tornado.websocket.WebSocketClosedError):
-            self.drop()
 
-    def drop(self) -> None:
+    def on_message(self, message: str | bytes) -> None:
+        """Browsers have nothing to say."""
+
+    def on_close(self) -> None:
         """Close the connection at once, whether the browser answers or not."""
         self._writer.cancel()
         self.view.sockets.discard(self)
@@ -80,85 +77,65 @@ class _Socket(_Door, tornado.websocket.WebSocketHandler):
         if stream is not None:
             stream.close()
 
-    def on_message(self, message: str | bytes) -> None:
-        """Browsers have nothing to say."""
-
-    def on_close(self) -> None:
-        self.drop()
-
 
 class LiveView:
-    """A scene in the browser that follows the program; also a window that meshcat can draw into.
+    """A scene in the browser that follows the program.
 
-    Args:
-        scene: the scene to serve; its poses are the starting ones. Cloths stay as they were.
-        timeout: seconds without an update or a visit after which the server closes itself.
+    The poses of `scene` are the starting ones, and cloths stay as they were. After `timeout`
+    seconds without an update or a visit the server closes itself.
 
     Raises:
         ValueError: unless `timeout` is positive.
-        TimeoutError: if the server has not started after five seconds.
     """
 
-    def __init__(self, scene: Scene, timeout: float = 600.0) -> None:
+    def __init__(self, scene: Any, timeout: float = 600.0) -> None:
         if not timeout > 0:
             raise ValueError(f"timeout must be positive, got {timeout}")
         self.scene, self.timeout = scene, float(timeout)
         self.sockets: set[_Socket] = set()
         self.commands: dict[Any, bytes] = dict(enumerate(scene.commands))
-        self._paths: tuple[mujoco.MjModel, list[str]] | None = None
-        self._ready, self._closed = threading.Event(), threading.Event()
         self._loop = asyncio.new_event_loop()
+        self._stopping = self._loop.create_future()
+        self._listeners = tornado.netutil.bind_sockets(0, _HOST)
+        self.port = self._listeners[0].getsockname()[1]
+        self.touch()
         self._thread = threading.Thread(target=self._run, name="cmc-live-view", daemon=True)
         self._thread.start()
-        if not self._ready.wait(5.0):
-            raise TimeoutError("the live view did not start within five seconds")
-        atexit.register(self.close)
 
     @property
     def url(self) -> str:
         """Address of the page, on this machine only."""
-        return f"http://{HOST}:{self.port}/"
+        return f"http://{_HOST}:{self.port}/"
 
     @property
     def closed(self) -> bool:
         """Whether the server has been closed, by `close` or by its timeout."""
-        return self._closed.is_set()
-
-    @property
-    def visualizer(self) -> Any:
-        """A `meshcat.Visualizer` that draws into this view."""
-        return meshcat.Visualizer(window=self)  # type: ignore[no-untyped-call]
+        return not self._thread.is_alive()
 
     def show(self, height: int = 480) -> LiveView:
         """Show the page in a notebook whose browser runs on this machine."""
         display(IFrame(self.url, width="100%", height=height))
         return self
 
-    def send(self, command: Any) -> None:
+    def update(self, data: mujoco.MjData) -> None:
+        """Show the pose `data` holds; the newest one wins if browsers are slower than updates."""
+        model, paths = data.model, body_paths(data.model)
+        for body in np.flatnonzero((model.body_weldid > 0) | (model.body_mocapid >= 0)):
+            matrix = transform(data.xpos[body], data.xquat[body]).T.ravel().tolist()
+            self.send(type="set_transform", path=f"/meshcat/{paths[body]}", matrix=matrix)
+
+    def send(self, **command: Any) -> None:
         """Send one meshcat command to every browser, now and to those that come later."""
         if self.closed:
             raise RuntimeError("the live view is closed")
-        lowered = command.lower()
-        key, data = (lowered["type"], lowered["path"]), umsgpack.packb(lowered)
+        key, data = (command["type"], command["path"]), umsgpack.packb(command)
         self._loop.call_soon_threadsafe(self._keep, key, data)
-
-    def update(self, data: mujoco.MjData) -> None:
-        """Show the pose `data` holds; the newest one wins if browsers are slower than updates."""
-        model = data.model
-        if self._paths is None or self._paths[0] is not model:
-            self._paths = model, body_paths(model)
-        for body in np.flatnonzero((model.body_weldid > 0) | (model.body_mocapid >= 0)):
-            pose = transform(data.xpos[body], data.xquat[body])
-            self.visualizer[self._paths[1][body]].set_transform(pose)
 
     def close(self) -> None:
         """Close sockets, port and thread; calling it again does nothing."""
-        if not self._closed.is_set():
-            with contextlib.suppress(RuntimeError):  # the loop may have just stopped by itself
-                self._loop.call_soon_threadsafe(self._stopping.set)
-        if threading.current_thread() is not self._thread:
-            self._thread.join(5.0)
-        atexit.unregister(self.close)
+        with contextlib.suppress(RuntimeError):  # the loop may have stopped by itself
+            self._loop.call_soon_threadsafe(self._stopping.cancel)
+        self._thread.join(5.0)
 
     def __enter__(self) -> LiveView:
         return self
@@ -173,39 +150,22 @@ class LiveView:
         self._last_use = self._loop.time()
 
     def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
-        try:
-            self._loop.run_until_complete(self._serve())
-        finally:
-            self._closed.set()
-            self._ready.set()
-            self._loop.close()
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            runner.run(self._serve())
 
     async def _serve(self) -> None:
-        self._stopping = asyncio.Event()
-        self.touch()
         shared = {"view": self}
-        application = tornado.web.Application(
-            [("/", _Page, shared), ("/socket", _Socket, shared)],
-            log_function=lambda handler: None,
-        )
+        routes: list[Any] = [("/", _Page, shared), ("/socket", _Socket, shared)]
+        application = tornado.web.Application(routes, log_function=lambda handler: None)
         server = tornado.httpserver.HTTPServer(application)
-        listeners = tornado.netutil.bind_sockets(0, HOST)
-        self.port = listeners[0].getsockname()[1]
-        server.add_sockets(listeners)
-        self._ready.set()
-        while not self._stopping.is_set() and self._loop.time() - self._last_use < self.timeout:
-            with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._stopping.wait(), min(0.2, self.timeout))
+        server.add_sockets(self._listeners)
+        while not self._stopping.done() and self._loop.time() - self._last_use < self.timeout:
+            await asyncio.wait([self._stopping], timeout=min(0.2, self.timeout))
         server.stop()
         for socket in list(self.sockets):
-            socket.drop()
-        with contextlib.suppress(asyncio.TimeoutError):
+            socket.on_close()
+        with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(server.close_all_connections(), 2.0)
-        tasks = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
 
     def _keep(self, key: tuple[str, str], data: bytes) -> None:
         self.touch()

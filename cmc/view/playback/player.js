@@ -386,7 +386,7 @@ function look(index) {
     (b, i) => b.setAttribute("aria-pressed", String(i === index)));
 }
 
-// ---- controls, keys, and messages from a slider beside the frame -------------------------------
+// ---- controls, keys, and messages from the page around the frame -------------------------------
 names.forEach((name, i) => {
   const button = document.createElement("button");
   button.textContent = name;
@@ -411,12 +411,10 @@ window.addEventListener("keydown", (event) => {
 window.addEventListener("message", (event) => {
   const message = event.data;
   if (!message || message.cmcPlayback !== CONTENT.id) return;
-  if ("seek" in message) { setPlaying(false); seek(Number(message.seek)); }
-  if ("play" in message) setPlaying(Boolean(message.play));
-  if ("speed" in message) setSpeed(Number(message.speed));
-  if ("camera" in message) look(Number(message.camera));
+  setPlaying(false);
+  seek(Number(message.seek));
 });
-if (duration === 0 || !CONTENT.slider) {
+if (duration === 0) {
   for (const id of ["play", "time", "clock", "speed"]) byId(id).style.display = "none";
 }
 look(0);

@@ -1,75 +1,138 @@
 """A trajectory of any MuJoCo model as a scene that plays.
 
 The scene is drawn once; the poses of moving bodies are stored as float32 world poses per frame, and
-what changes its shape (flexes, skins, tendons) as corners per frame. Not drawn: sites without a
-material, lights, skyboxes. What cannot be drawn at all is left out and named in a warning.
+what changes its shape (flexes, tendons) as corners per frame. Not drawn: sites without a material,
+lights, skyboxes. What cannot be drawn at all is left out and named in a warning.
 """
 
 from __future__ import annotations
 
+import os
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+from IPython.display import HTML, IFrame
 from numpy.typing import ArrayLike, NDArray
 
 from cmc.store import write_atomic
-from cmc.view.playback import notebook
-from cmc.view.playback.cameras import Camera
-from cmc.view.playback.drawing import draw, drawn_bodies
+from cmc.view.playback.cameras import Camera, presets
 from cmc.view.playback.live import LiveView
-from cmc.view.playback.motion import Motion
-from cmc.view.playback.overlays import Arrow, Label, Overlay, as_overlays, rows_of, trail
+from cmc.view.playback.motion import Motion, skins
 from cmc.view.playback.page import page
-from cmc.view.playback.scene import Cloth, Scene, Skin, body_paths
-from cmc.view.playback.soft import skins
+from cmc.view.playback.shapes import body_paths, draw, visible
+from cmc.view.playback.textures import Array
 
-Array = NDArray[np.float64]
 _STATES = (mujoco.mjtState.mjSTATE_FULLPHYSICS, mujoco.mjtState.mjSTATE_INTEGRATION)
+
+# Okabe-Ito, readable with every kind of color vision
+_TRAIL, _ARROW, _MARKERS = 0x0072B2, 0xD55E00, (0xE69F00, 0x009E73, 0xCC79A7)
+
+
+@dataclass(frozen=True)
+class Marker:
+    """A see-through ball of a radius, m, at (T, 3) or (3,), m; rows of NaN hide it."""
+
+    points: ArrayLike
+    radius: float = 0.002
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """A vector (T, 3), drawn from `points`, (T, 3) or (3,), in m, `scale` metres long per unit.
+
+    `radius` of the shaft in m. Vectors shorter than 1e-3, in any unit (N for a force), are hidden.
+    """
+
+    points: ArrayLike
+    vectors: ArrayLike
+    scale: float = 0.005
+    radius: float = 0.0006
 
 
 class Playable:
-    """What can be saved as a page or shown in a notebook."""
+    """What can be saved as a page or shown in a notebook: `scenes`, from left to right."""
 
-    @property
-    def scenes(self) -> tuple[Scene, ...]:
-        """The scenes, from left to right."""
-        raise NotImplementedError
+    def __init__(self, *scenes: Recording) -> None:
+        self.scenes = scenes
 
-    def html(self, *, slider: bool = True) -> str:
+    def html(self) -> str:
         """The whole page as text: viewer, scenes and motion, nothing loaded from elsewhere."""
-        return page(self.scenes, slider=slider)
+        return page(self.scenes)
 
     def save(self, path: str | Path) -> Path:
         """Write the page to `path` (a half-written page never appears) and return the path."""
-        text = self.html().encode()
-        return write_atomic(path, lambda file: file.write(text))
+        return write_atomic(path, lambda file: file.write(self.html().encode()))
 
-    def show(self, path: str | Path | None = None, height: int = 480, slider: Any = None) -> Any:
+    def show(self, path: str | Path | None = None, height: int = 480) -> Any:
         """The page for a notebook to display: saved to `path`, or embedded without one.
 
         A saved page keeps the notebook small, but needs a server that delivers it (JupyterLab).
         In VS Code, Colab and voila, or with CMC_EMBED=1 (for exported HTML), the page is embedded
-        all the same, which takes 1 MB.
-
-        Args:
-            path: where to save, relative to the notebook.
-            height: height of the frame in pixels.
-            slider: an ipywidgets slider in seconds that moves the scene in place of the page's own.
+        all the same, which takes 1 MB. `height` of the frame in pixels. A path that is absolute or
+        leads upwards is refused: no server would deliver it.
         """
-        return notebook.show(self.scenes, path, height=height, slider=slider)
+        return framed(self.html(), path, height)
+
+
+def framed(text: str, path: str | Path | None = None, height: int = 480) -> Any:
+    """A page in a frame: from a file at `path`, which is written, or held by the notebook."""
+    if path is None or _must_embed():  # a frame with no rights but to run its scripts
+        style = f"width:100%;height:{height}px;border:0"
+        look = f'sandbox="allow-scripts" title="3D playback" style="{style}"'
+        return HTML(f'<div><iframe srcdoc="{escape(text)}" {look}></iframe></div>')
+    path = Path(path)
+    if path.is_absolute() or ".." in path.parts:
+        raise ValueError(f"path must be relative and below the notebook, got {path}")
+    write_atomic(path, lambda file: file.write(text.encode()))
+    return IFrame(path.as_posix(), width="100%", height=height)
+
+
+def _must_embed() -> bool:
+    """Whether no server here would deliver a file beside the notebook, or CMC_EMBED is 1."""
+    return (
+        os.environ.get("CMC_EMBED", "0") not in ("", "0")
+        or "VSCODE_PID" in os.environ
+        or "google.colab" in sys.modules
+        or os.environ.get("SERVER_SOFTWARE", "").startswith("voila")
+    )
 
 
 @dataclass(frozen=True)
-class Recording(Playable, Scene):
-    """A scene made by `record`; saved, shown or served from here."""
+class Recording(Playable):
+    """A scene and what moves in it, made by `record`; saved, shown or served from here.
 
-    @property
-    def scenes(self) -> tuple[Scene, ...]:
+    Attributes:
+        times: (T,) seconds, increasing.
+        bodies: paths in the scene of the bodies that move.
+        poses: (T, len(bodies), 7) float32 world poses: position in m, quaternion with w first.
+        commands: meshcat commands that draw the scene at the first frame.
+        cloths: flexes and tendons, see `motion.Motion`.
+        skins: see `motion.skins`; the `body` of their bones counts in `bodies`.
+        overlays: trails, markers, arrows, labels, with points (T, 3).
+        readouts: named values (T,).
+        cameras: presets by name, the first one is used on opening.
+    """
+
+    title: str
+    times: Array
+    bodies: Sequence[str]
+    poses: NDArray[np.float32]
+    commands: Sequence[bytes]
+    cloths: Sequence[dict[str, Any]]
+    skins: Sequence[dict[str, Any]]
+    overlays: Sequence[dict[str, Any]]
+    readouts: Mapping[str, Array]
+    cameras: Mapping[str, Camera]
+
+    @property  # type: ignore[override]
+    def scenes(self) -> tuple[Recording, ...]:  # type: ignore[override]
         """This scene alone."""
         return (self,)
 
@@ -78,23 +141,11 @@ class Recording(Playable, Scene):
         return LiveView(self, timeout=timeout)
 
 
-@dataclass(frozen=True)
-class Beside(Playable):
-    """Scenes side by side under one time slider, such as a success beside a failure."""
-
-    recordings: tuple[Scene, ...]
-
-    @property
-    def scenes(self) -> tuple[Scene, ...]:
-        """The scenes, from left to right."""
-        return self.recordings
-
-
-def beside(*recordings: Scene) -> Beside:
-    """Show recordings side by side: one time slider, and cameras of the same name together."""
+def beside(*recordings: Recording) -> Playable:
+    """Recordings side by side: one time slider, and cameras of the same name together."""
     if not recordings:
         raise ValueError("wanted at least one recording, got none")
-    return Beside(recordings)
+    return Playable(*recordings)
 
 
 def record(
@@ -104,21 +155,19 @@ def record(
     *,
     title: str = "Playback",
     trails: Sequence[str] = (),
-    markers: Mapping[str, ArrayLike] | None = None,
+    markers: Mapping[str, ArrayLike | Marker] | None = None,
     arrows: Mapping[str, Arrow] | None = None,
     labels: Mapping[str, str | ArrayLike] | None = None,
     readouts: Mapping[str, ArrayLike] | None = None,
     cameras: Mapping[str, Camera] | None = None,
-    mocap: tuple[ArrayLike, ArrayLike] | None = None,
     groups: Sequence[int] = (0, 1, 2),
-    tail: float | None = None,
 ) -> Recording:
     """Record a motion of a MuJoCo model.
 
     Args:
         model: the compiled model.
         states: (T, nq) joint positions, or (T, size) full states as `mj_getState` returns them for
-            FULLPHYSICS or INTEGRATION, as an array or a list of vectors.
+            FULLPHYSICS or INTEGRATION (which holds mocap bodies), as an array or a list of vectors.
         times: (T,) times in seconds, strictly increasing.
         title: heading of the page.
         trails: sites or bodies that leave a trail.
@@ -127,99 +176,79 @@ def record(
         labels: word to the site or body that it stands beside, or to a point (3,) or (T, 3), m.
         readouts: values (T,) printed beside the scene, such as {"force [N]": f}.
         cameras: presets; left out, they frame what moves and the scene, and are the model's own.
-        mocap: positions (T, nmocap, 3) and quaternions (T, nmocap, 4) of mocap bodies, where the
-            states do not hold them.
         groups: geom, site, tendon, flex and skin groups that are drawn.
-        tail: seconds kept after the last motion; everything is kept by default.
 
     Raises:
         ValueError: for states, times or overlays of the wrong shape, not finite, or out of order,
-            and for trails, labels or cameras that name no site or body.
+            and for trails or labels that name no site or body.
     """
     time, rows, spec = _checked(model, states, times)
-    motion = Motion(model, rows, spec, mocap, groups)
+    motion = Motion(model, rows, spec, groups)
     tracks = {name: motion.point(name) for name in trails}
-    drawn = drawn_bodies(model, groups)
-    worn = skins(model, groups)
-    bones = {bone.body for skin in worn for bone in skin.bones}
-    known = sorted({*drawn, *bones})
-    moving = [b for b in known if b in bones or np.ptp(motion.poses[:, b], axis=0).max() > 0.0]
-    presets = cameras or motion.cameras(moving, groups, tracks)
-    presets = {
-        name: camera.along(tracks.get(camera.follow, motion.point(camera.follow)))
-        if camera.follow
-        else camera
-        for name, camera in presets.items()
-    }
-    words = {
-        word: motion.point(at) if isinstance(at, str) else rows_of(word, at, len(time))
-        for word, at in (labels or {}).items()
-    }
-    over: list[Overlay] = [trail(name, track) for name, track in tracks.items()]
-    over += as_overlays(len(time), markers or {}, arrows or {})
-    over += [Label(word, points) for word, points in words.items()]
-    paths = body_paths(model)
-    whole = Recording(
-        title=title,
-        times=time,
-        bodies=tuple(paths[b] for b in moving),
-        poses=np.ascontiguousarray(motion.poses[:, moving]),
-        commands=tuple(draw(model, motion.data, groups).commands),
-        cloths=motion.cloths,
-        skins=tuple(_with_bodies(skin, moving) for skin in worn),
-        overlays=tuple(over),
-        readouts={name: _values(name, v, len(time)) for name, v in (readouts or {}).items()},
-        cameras=presets,
-    )
-    if not (drawn or whole.cloths or worn):
+    drawn, worn = list(visible(model, groups)), skins(model, groups)
+    if not (drawn or motion.cloths or worn):
         there = sorted(set(map(int, model.geom_group)))
         warnings.warn(f"nothing of groups {tuple(groups)} is seen; geoms: {there}", stacklevel=2)
-    return whole if tail is None else _until_rest(whole, tail)
-
-
-def _with_bodies(skin: Skin, moving: Sequence[int]) -> Skin:
-    """The skin with bones that count in the bodies whose poses are stored."""
-    bones = tuple(replace(bone, body=moving.index(bone.body)) for bone in skin.bones)
-    return replace(skin, bones=bones)
-
-
-def _until_rest(whole: Recording, tail: float) -> Recording:
-    """The recording up to `tail` seconds after the last frame away from the final poses.
-
-    Away is farther than a hundredth of the largest distance (in m, and turns in rad / 10).
-    """
-    apart = np.abs(whole.poses - whole.poses[-1]) * [1, 1, 1, 0.2, 0.2, 0.2, 0.2]
-    away = apart.reshape(len(apart), -1).max(axis=1, initial=0.0)
-    moved = np.flatnonzero(away > 0.01 * away.max())
-    end = whole.times[moved[-1]] + tail if len(moved) else whole.times[0] + tail
-    return cut(whole, int(np.searchsorted(whole.times, end, side="right")))
-
-
-def cut(whole: Recording, frames: int) -> Recording:
-    """The first `frames` frames of a recording."""
-    count = len(whole.times)
-
-    def rows(array: Any) -> Any:
-        return array[:frames] if np.ndim(array) == 2 and len(array) == count else array
-
-    cameras = {
-        n: Camera(rows(c.position), rows(c.target), c.follow, rows(c.up), c.field_of_view)
-        for n, c in whole.cameras.items()
+    bones = {bone["body"] for skin in worn for bone in skin["bones"]}
+    goes = np.ptp(motion.poses, axis=0).max(axis=1) > 0.0
+    moving = [b for b in sorted({*drawn, *bones}) if b in bones or goes[b]]
+    for bone in (bone for skin in worn for bone in skin["bones"]):
+        bone["body"] = moving.index(bone["body"])
+    words = {
+        word: motion.point(at) if isinstance(at, str) else at for word, at in (labels or {}).items()
     }
-    cloths = [Cloth(c.name, c.faces, c.rgba, c.corners[:frames]) for c in whole.cloths]
-    overlays = [type(o)(**{k: rows(v) for k, v in vars(o).items()}) for o in whole.overlays]
+    paths = body_paths(model)
     return Recording(
-        title=whole.title,
-        times=whole.times[:frames],
-        bodies=whole.bodies,
-        poses=whole.poses[:frames],
-        commands=whole.commands,
-        cloths=tuple(cloths),
-        skins=whole.skins,
-        overlays=tuple(overlays),
-        readouts={name: v[:frames] for name, v in whole.readouts.items()},
-        cameras=cameras,
+        title=title,
+        times=time,
+        bodies=[paths[b] for b in moving],
+        poses=np.ascontiguousarray(motion.poses[:, moving]),
+        commands=draw(model, motion.data, groups),
+        cloths=motion.cloths,
+        skins=worn,
+        overlays=_overlays(len(time), tracks, markers or {}, arrows or {}, words),
+        readouts={name: _fit(name, v, time.shape) for name, v in (readouts or {}).items()},
+        cameras=cameras or presets(motion, moving, tracks),
     )
+
+
+def _overlays(
+    frames: int,
+    tracks: Mapping[str, Array],
+    markers: Mapping[str, ArrayLike | Marker],
+    arrows: Mapping[str, Arrow],
+    words: Mapping[str, ArrayLike],
+) -> list[dict[str, Any]]:
+    """What is drawn over the scene, as the player reads it, every array (frames, 3)."""
+    found: list[dict[str, Any]] = []
+    shapes = (3,), (frames, 3)
+    for name, points in tracks.items():  # a tube as thin as the path is small
+        size = float(np.linalg.norm(np.ptp(points, axis=0)))
+        look = {"color": _TRAIL, "radius": float(np.clip(0.004 * size, 1e-4, 4e-3))}
+        found.append({"kind": "Trail", "name": name, "points": points, **look})
+    for i, (name, given) in enumerate(markers.items()):
+        marker = given if isinstance(given, Marker) else Marker(given)
+        points, color = _fit(name, marker.points, *shapes), _MARKERS[i % len(_MARKERS)]
+        look = {"color": color, "radius": marker.radius}
+        found.append({"kind": "Marker", "name": name, "points": points, **look})
+    for name, arrow in arrows.items():
+        rows = {key: _fit(name, getattr(arrow, key), *shapes) for key in ("points", "vectors")}
+        if not all(np.isfinite(array).all() for array in rows.values()):
+            raise ValueError(f"arrow {name!r} must be finite")
+        look = {"scale": arrow.scale, "radius": arrow.radius, "color": _ARROW, "threshold": 1e-3}
+        found.append({"kind": "Arrow", "name": name, **rows, **look})
+    for word, at in words.items():
+        found.append({"kind": "Label", "name": word, "points": _fit(word, at, *shapes)})
+    return found
+
+
+def _fit(name: str, array: ArrayLike, *shapes: tuple[int, ...]) -> Array:
+    """An array of one of the shapes, broadcast to the last."""
+    rows = np.asarray(array, dtype=float)
+    if rows.shape not in shapes:
+        wanted = " or ".join(map(str, shapes))
+        raise ValueError(f"{name!r} must have shape {wanted}, got {rows.shape}")
+    return np.broadcast_to(rows, shapes[-1])
 
 
 def _checked(
@@ -240,10 +269,3 @@ def _checked(
     if np.any(np.diff(time) <= 0.0):
         raise ValueError("times must increase strictly")
     return time, rows, None if rows.shape[1] == model.nq else sizes[rows.shape[1]]
-
-
-def _values(name: str, values: ArrayLike, frames: int) -> Array:
-    array = np.asarray(values, dtype=float)
-    if array.shape != (frames,):
-        raise ValueError(f"readout {name!r} must have shape ({frames},), got {array.shape}")
-    return array

@@ -1,5 +1,5 @@
 """A Panda in the browser: physics, control and policies in one HTML file."""
 
-from cmc.view.simulator.page import live_page, save_live_page
+from cmc.view.simulator.page import live_page
 
-__all__ = ["live_page", "save_live_page"]
+__all__ = ["live_page"]

@@ -171,7 +171,7 @@ const hear = {
       while (arms[k].trace.length && state.time - arms[k].trace[0][0] > 10) arms[k].trace.shift();
     });
   },
-  replayed({ qpos }) { live.replayed = qpos; },
+  replayed(answer) { live.replayed = answer; },
   failed({ text }) {
     live.failed = text;
     const note = byId("note") || document.body.appendChild(Object.assign(document.createElement("div"), { id: "note" }));
@@ -229,7 +229,7 @@ arms.forEach((arm) => {
     };
   });
 });
-live.replay = (choice, start, ticks) => tell({ kind: "replay", policy: policyOf(choice), start, ticks });
+live.replay = (choice, start, ticks, more) => tell({ kind: "replay", policy: policyOf(choice), start, ticks, ...more });
 
 // ---- drawing: poses when the browser draws, physics by the clock --------------------------------------
 function paint() {

@@ -12,16 +12,15 @@ import html
 import json
 from collections.abc import Mapping, Sequence
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from cmc.store import asset, write_atomic
-from cmc.view.playback.drawing import draw, drawn_bodies
+from cmc.store import asset
 from cmc.view.playback.page import viewer_source
-from cmc.view.playback.scene import body_paths
+from cmc.view.playback.shapes import body_paths, draw, visible
+from cmc.view.style import METHOD_COLORS
 
 GROUPS = (0, 1, 2)
 
@@ -31,50 +30,50 @@ def live_page(
     policies: Sequence[Mapping[str, Any]],
     *,
     title: str,
-    arms: Sequence[Mapping[str, int]] = ({"method": 0, "kept": 0, "seed": 0},),
-    plan: bool = True,
-    target: Sequence[float] | None = None,
-    camera: Mapping[str, Sequence[float]] | None = None,
+    arms: int = 1,
+    seed: int = 0,
 ) -> str:
     """The page as text.
 
     Args:
-        task: scene, control law, limits and starts (`cmc.studies.live.live_task`).
-        policies: what can be chosen: name, title, color, and the kept policies of every seed
-            (`cmc.studies.live.live_policies`).
+        task: scene, control law, limits and starts (`cmc.studies.live.live_task`); SI units.
+        policies: what can be chosen (`cmc.studies.live.live_policies`).
         title: heading.
-        arms: one or two arms side by side, each the indices of a method, kept policy and seed.
-        plan: whether the planner sets the sub-goals at first, or the reader.
-        target: the first sub-goal where the reader sets it, (3,), m.
-        camera: position and target in m; by default near the first goal.
+        arms: one, whose planner sets the sub-goals at first, or two side by side, with the first
+            two policies, for which the reader sets them.
+        seed: number of the seed in the last kept policy of each.
 
     Raises:
-        ValueError: for no arm or more than two, or an arm that names no policy.
+        ValueError: for another number of arms, or a policy that is not there.
     """
-    if not 1 <= len(arms) <= 2:
-        raise ValueError(f"arms: wanted one or two, got {len(arms)}")
-    for arm in arms:
-        try:
-            policies[arm["method"]]["kept"][arm["kept"]]["policies"][arm["seed"]]
-        except (IndexError, KeyError) as error:
-            raise ValueError(f"arms: no policy {dict(arm)}") from error
+    if arms not in (1, 2) or arms > len(policies):
+        raise ValueError(f"arms: wanted 1 or 2, each with a policy of {len(policies)}, got {arms}")
+    for policy in policies[:arms]:
+        last = len(policy["kept"][-1]["seeds"]) - 1
+        if not 0 <= seed <= last:
+            raise ValueError(f"seed: wanted 0 to {last} for {policy['name']}, got {seed}")
     model = mujoco.MjModel.from_xml_string(task["xml"])
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     paths = body_paths(model)
-    goal = np.array(task["starts"][0]["goal"])
-    view = camera or {"position": (goal + [0.06, -0.09, 0.06]).tolist(), "target": goal.tolist()}
+    goal, far = np.array(task["starts"][0]["goal"]), 1.6 if arms == 2 else 1.0
     content = {
         "title": title,
         "task": task,
-        "policies": _packed(policies),
-        "arms": [dict(arm) for arm in arms],
-        "plan": plan,
-        "target": list(target) if target is not None else (goal + [0, 0, 0.02]).tolist(),
-        "camera": view,
+        "policies": [{"color": METHOD_COLORS[p["name"]], **_packed(p)} for p in policies],
+        "arms": [
+            {"method": k, "kept": len(p["kept"]) - 1, "seed": seed}
+            for k, p in enumerate(policies[:arms])
+        ],
+        "plan": arms == 1,
+        "target": (goal + [0, 0, 0.02]).tolist(),
+        "camera": {
+            "position": (goal + far * np.array([0.06, -0.09, 0.06])).tolist(),
+            "target": goal.tolist(),
+        },
         "ball": 0.0012,
-        "commands": [_text(command) for command in draw(model, data, GROUPS).commands],
-        "bodies": [{"path": paths[b], "id": b} for b in drawn_bodies(model, GROUPS)],
+        "commands": [_text(command) for command in draw(model, data, GROUPS)],
+        "bodies": [{"path": paths[b], "id": b} for b in visible(model, GROUPS)],
     }
     parts = {
         "TITLE": html.escape(title),
@@ -88,18 +87,12 @@ def live_page(
     return head + "".join(parts.get(part, part) for part in rest)
 
 
-def save_live_page(path: str | Path, *args: Any, **options: Any) -> Path:
-    """Write `live_page(...)` to a file (a half-written page never appears) and return its path."""
-    text = live_page(*args, **options).encode()
-    return write_atomic(path, lambda file: file.write(text))
-
-
 def _engine() -> str:
     """MuJoCo's loader as a classic script, the world and the worker, without a closing tag."""
-    loader = asset("mujoco", "mujoco.js").read_text("utf-8")
-    loader = loader.replace("export default loadMujoco;", "").replace(
-        "import.meta.url", "'file:///'"
+    loader = (
+        asset("mujoco", "mujoco.js").read_text("utf-8").replace("export default loadMujoco;", "")
     )
+    loader = loader.replace("import.meta.url", "'file:///'")
     source = "\n".join([loader, _own("world.js"), _own("worker.js")])
     if "</script" in source:
         raise RuntimeError("the engine cannot be inlined: it contains a closing script tag")
@@ -111,10 +104,8 @@ def _packed(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return _text(np.ascontiguousarray(value, dtype="<f4").tobytes())
     if isinstance(value, Mapping):
-        sizes = {}
-        if isinstance(value.get("w"), np.ndarray):
-            sizes = {"inputs": value["w"].shape[0], "outputs": value["w"].shape[1]}
-        return {key: _packed(item) for key, item in value.items()} | sizes
+        sizes = zip(("inputs", "outputs"), value["w"].shape, strict=True) if "w" in value else ()
+        return {key: _packed(item) for key, item in value.items()} | dict(sizes)
     return [_packed(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 

@@ -44,12 +44,19 @@ function serve(port, load) {
       pushEnds = arms[0].world.tick + (seconds ?? Infinity) / task.tick;
     },
     restart({ start }) { restart(start); },
-    // A whole test episode at once, as fast as it goes: the rows of joint positions.
-    replay({ policy, start, ticks }) {
-      const world = new World(mj, task), qpos = [];
+    // A whole episode at once, as fast as it goes: joints, and distances to the sub-goal.  With
+    // `target` no planner moves it; `force` acts on the tip in the ticks of `span`.
+    replay({ policy, start, ticks, target, force, span = [0, 0] }) {
+      const world = new World(mj, task), qpos = [], away = [];
       world.reset(task.starts[start]);
-      for (let k = 0; k < ticks; k++) { qpos.push(Array.from(world.data.qpos)); world.follow(policy); }
-      port.postMessage({ kind: "replayed", qpos });
+      if (target) world.setTarget(target);
+      for (let k = 0; k < ticks; k++) {
+        qpos.push(Array.from(world.data.qpos));
+        world.push(k >= span[0] && k < span[1] ? force : [0, 0, 0]);
+        world.follow(policy, !target);
+        away.push(length(world.target.map((x, i) => x - world.tip[i])));
+      }
+      port.postMessage({ kind: "replayed", qpos, away });
     },
   };
   port.onmessage = ({ data }) => Promise.resolve(answers[data.kind](data)).catch(
