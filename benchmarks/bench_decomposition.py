@@ -6,11 +6,11 @@ complex, defective and singular systems. `numpy_eig_qr` is the two calls alone, 
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
 
+from benchmarks import best
 from cmc.theory.auxiliary import decompose
 from cmc.theory.tracking import Tracker
 
@@ -23,22 +23,6 @@ def plain(f_y: np.ndarray, f_u: np.ndarray) -> tuple[np.ndarray, ...]:
     return T_y, Q[..., ::-1], eigenvalues, np.swapaxes(R_qr, -1, -2)[..., ::-1, ::-1]
 
 
-def two_calls(f_y: np.ndarray, f_u: np.ndarray) -> None:
-    np.linalg.eig(f_y)
-    np.linalg.qr(f_u)
-
-
-def seconds(call: Callable[[], object], number: int, repeats: int = 9) -> float:
-    """Best CPU time of one call."""
-    best = np.inf
-    for _ in range(repeats):
-        start = time.process_time()
-        for _ in range(number):
-            call()
-        best = min(best, (time.process_time() - start) / number)
-    return best
-
-
 def systems(n: int, number: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(n)
     V = np.eye(n) + 0.3 * rng.normal(size=(number, n, n))
@@ -46,29 +30,29 @@ def systems(n: int, number: int) -> tuple[np.ndarray, np.ndarray]:
     return f_y, rng.normal(size=(number, n, n))
 
 
+def measure(f_y: np.ndarray, f_u: np.ndarray, number: int) -> dict[str, float]:
+    tracker = Tracker()
+    calls = {
+        "ours": lambda: decompose(f_y, f_u),
+        "plain": lambda: plain(f_y, f_u),
+        "two calls": lambda: (np.linalg.eig(f_y), np.linalg.qr(f_u)),
+    }
+    if f_y.ndim == 2:
+        calls["tracked"] = lambda: tracker.update(f_y, f_u)
+    return best(calls, number)
+
+
 def run() -> Iterator[dict]:
-    for label, n, number, loops in (("one 2x2", 2, 1, 2000), ("100000 of 2x2", 2, 100_000, 1)):
+    for n, number, loops in ((2, 1, 2000), (2, 100_000, 1), (6, 1, 500)):
         f_y, f_u = systems(n, number)
+        cost = measure(f_y[0], f_u[0], loops) if number == 1 else measure(f_y, f_u, loops)
+        row = {
+            "name": f"decompose, {number} of {n}x{n}",
+            "ratio": round(cost["plain"] / cost["ours"], 2),
+            "ratio_numpy_eig_qr": round(cost["two calls"] / cost["ours"], 2),
+            "microseconds": round(1e6 * cost["ours"], 2),
+        }
         if number == 1:
-            f_y, f_u = f_y[0], f_u[0]
-        ours = seconds(lambda: decompose(f_y, f_u), loops)  # noqa: B023
-        full = seconds(lambda: plain(f_y, f_u), loops)  # noqa: B023
-        least = seconds(lambda: two_calls(f_y, f_u), loops)  # noqa: B023
-        yield {
-            "name": f"decompose {label}",
-            "ratio": round(full / ours, 2),
-            "ratio_numpy_eig_qr": round(least / ours, 2),
-            "microseconds": round(1e6 * ours, 2),
-        }
-    for n in (2, 6):
-        f_y, f_u = systems(n, 1)
-        once = seconds(lambda: decompose(f_y[0], f_u[0]), 500)  # noqa: B023
-        tracker = Tracker()
-        tracked = seconds(lambda: tracker.update(f_y[0], f_u[0]), 500)  # noqa: B023
-        full = seconds(lambda: plain(f_y[0], f_u[0]), 500)  # noqa: B023
-        yield {
-            "name": f"control rate at n = {n}",
-            "ratio": round(full / once, 2),
-            "rate_hz": round(1.0 / once),
-            "tracked_rate_hz": round(1.0 / tracked),
-        }
+            row |= {"rate_hz": round(1.0 / cost["ours"])}
+            row |= {"tracked_rate_hz": round(1.0 / cost["tracked"])}
+        yield row

@@ -17,13 +17,13 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 
+from benchmarks import best
 from cmc.envs.panda_task import PandaTask
 from cmc.envs.peg_maze import JOINT, SOFT, STIFF, PegMaze, PegMazeEnv
 from cmc.envs.peg_push import BOX_TOP, PUSH, PegPush, PegPushEnv
 from cmc.robot.panda import LOWER, UPPER
 
 CASES = {"maze": (PegMaze, STIFF), "maze_soft": (PegMaze, SOFT), "push": (PegPush, PUSH)}
-REPEATS = 15
 
 
 def run() -> Iterator[dict[str, str | float]]:
@@ -31,27 +31,31 @@ def run() -> Iterator[dict[str, str | float]]:
     yield _first()
     for name, (task, config) in CASES.items():
         every = replace(config, hold=False)
-        calls = {
-            "raw": (_raw(task(config)), 1),
-            "one": (_ticks(task(config, 1)), 1),
-            "gym": (_gym(name), 1),
-            "many": (_ticks(task(config, 32)), 32),
-            "shared": (_ticks(task(config, 32, threads=os.cpu_count() or 1)), 32),
-            "every": (_ticks(task(every, 1)), 1),
-            "every_many": (_ticks(task(every, 32)), 32),
-        }
-        best = _best({key: call for key, (call, _) in calls.items()})
-        cost = {key: best[key] / worlds for key, (_, worlds) in calls.items()}
-        raw = cost["raw"]
+        cost = _best(
+            {
+                "raw": _raw(task(config)),
+                "one": _ticks(task(config, 1)),
+                "gym": _gym(name),
+                "many": _ticks(task(config, 32)),
+                "shared": _ticks(task(config, 32, threads=os.cpu_count() or 1)),
+                "every": _ticks(task(every, 1)),
+                "every_many": _ticks(task(every, 32)),
+            }
+        )
+        raw, many = cost["raw"], 32 * cost["raw"]
         yield {"name": f"{name}: one world", "ratio": cost["one"] / raw, "us": 1e6 * cost["one"]}
         yield {"name": f"{name}: through gymnasium", "ratio": cost["gym"] / raw}
-        yield {"name": f"{name}: 32 worlds, each", "ratio": cost["many"] / raw}
-        yield {"name": f"{name}: same, threads, CPU time", "ratio": cost["shared"] / raw}
+        yield {"name": f"{name}: 32 worlds, each", "ratio": cost["many"] / many}
+        yield {"name": f"{name}: same, threads, CPU time", "ratio": cost["shared"] / many}
         yield {"name": f"{name}: control at every step, share", "ratio": raw / cost["every"]}
-        yield {"name": f"{name}: same, 32 worlds, share", "ratio": raw / cost["every_many"]}
+        yield {"name": f"{name}: same, 32 worlds, share", "ratio": many / cost["every_many"]}
     yield _plan()
     for name, (task, config) in {**CASES, "maze_joint": (PegMaze, JOINT)}.items():
         yield {"name": f"{name}: 10^5 random ticks", **_drive(task(config, 32, seed=0))}
+
+
+def _best(calls: dict[str, Callable[[], object]]) -> dict[str, float]:
+    return best(calls, number=20, repeats=50)
 
 
 def _first() -> dict[str, str | float]:
@@ -133,27 +137,9 @@ def _plan(ticks: int = 300) -> dict[str, str | float]:
             data.ctrl[:] = torque
             mujoco.mj_step(model, data, 10)
 
-    best = dict.fromkeys((whole, raw), np.inf)
-    for _ in range(REPEATS):
-        for call in best:
-            begin = time.process_time()
-            call()
-            best[call] = min(best[call], time.process_time() - begin)
-    us = 1e6 * best[raw] / ticks
-    return {"name": "push: while solving it", "ratio": best[whole] / best[raw], "raw_us": us}
-
-
-def _best(calls: dict[str, Callable[[], object]]) -> dict[str, float]:
-    """CPU seconds per call, best of the repeats."""
-    best = dict.fromkeys(calls, np.inf)
-    counts = {key: 10 if key in ("many", "shared", "every_many") else 100 for key in calls}
-    for _ in range(REPEATS):
-        for key, call in calls.items():
-            start = time.process_time()
-            for _ in range(counts[key]):
-                call()
-            best[key] = min(best[key], (time.process_time() - start) / counts[key])
-    return best
+    cost = best({"whole": whole, "raw": raw}, repeats=15)
+    us = 1e6 * cost["raw"] / ticks
+    return {"name": "push: while solving it", "ratio": cost["whole"] / cost["raw"], "raw_us": us}
 
 
 def _drive(task: PandaTask) -> dict[str, float]:

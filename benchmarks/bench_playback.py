@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-import statistics
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import mujoco
 import numpy as np
 
+from benchmarks import best
 from cmc.robot.panda import load_scene
 from cmc.view.playback import record
 
 FRAMES = 1001  # 20 s at 50 Hz
-
-
-def _cpu(task: Callable[[], object], repeats: int = 5) -> float:
-    """Median CPU seconds of a task."""
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        task()
-        times.append(time.process_time() - start)
-    return statistics.median(times)
 
 
 def run() -> Iterator[dict]:
@@ -30,17 +19,21 @@ def run() -> Iterator[dict]:
     data = mujoco.MjData(model)
     qpos = data.qpos + 0.1 * np.sin(np.linspace(0, 20, FRAMES))[:, None] * np.ones(model.nq)
     times = 0.02 * np.arange(FRAMES)
-
-    step = _cpu(lambda: [mujoco.mj_step(model, data) for _ in range(FRAMES)]) / FRAMES
-    full = _cpu(lambda: record(model, qpos, times, trails=["tip"])) / FRAMES
     recording = record(model, qpos, times, trails=["tip"])
-    page = _cpu(recording.html) / FRAMES
-    yield {"name": "record, per frame against mj_step", "ratio": full / step, "us": 1e6 * full}
-    yield {"name": "write the page, per frame against mj_step", "ratio": page / step}
+    calls = {
+        "step": lambda: mujoco.mj_step(model, data, FRAMES),
+        "record": lambda: record(model, qpos, times, trails=["tip"]),
+        "page": recording.html,
+    }
+    cost = best(calls, repeats=5)
+    us = 1e6 * cost["record"] / FRAMES
+    ratio = cost["record"] / cost["step"]
+    yield {"name": "record, per frame against mj_step", "ratio": ratio, "us": us}
+    ratio = cost["page"] / cost["step"]
+    yield {"name": "write the page, per frame against mj_step", "ratio": ratio}
 
-    size = len(recording.html().encode())
+    size, moving = len(recording.html().encode()), len(recording.bodies)
     still = len(record(model, qpos[:1], times[:1]).html().encode())
-    moving = len(recording.bodies)
     yield {
         "name": "page of a 20 s episode at 50 Hz against 3 MB",
         "ratio": size / 3e6,

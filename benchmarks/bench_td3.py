@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from statistics import median
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from benchmarks import best
 from cmc.learning.td3 import TD3, Replay, TD3Config
 from cmc.policies import DirectPolicy, JointNetwork
 from cmc.studies import peg_maze, peg_push
@@ -28,7 +29,7 @@ from cmc.studies.study import Study
 
 PAPER, SMALL = (400, 300), (128, 128)
 ROWS, BATCH, PERIOD = 65_536, 128, 2
-WARM_UP, REPEATS = 20, 7
+REPEATS = 7
 CASES = [(peg_maze.STUDY, "ctd3"), (peg_maze.STUDY, "td3_corrected"), (peg_push.STUDY, "ctd3")]
 SEEDS, AIM_MS = 5, 0.6
 FIRST, STEPS, BLOCKS = 1_600, 800, 5
@@ -105,6 +106,11 @@ class _Spaces(gym.Env):  # type: ignore[type-arg]
         self.action_space = gym.spaces.Box(-1.0, 1.0, (outputs,), np.float32)
 
 
+def _often(call: Call, count: int) -> None:
+    for _ in range(count):
+        call()
+
+
 def _updates() -> Iterator[dict[str, Any]]:
     data = _data(*_sizes())
     for hidden, seeds, count in ((PAPER, 1, 60), (SMALL, SEEDS, 150)):
@@ -113,34 +119,18 @@ def _updates() -> Iterator[dict[str, Any]]:
             name: _theirs(data, hidden, unit)
             for name, unit in (("tanh", nn.Tanh), ("ReLU", nn.ReLU))
         }
-        runs: dict[str, Callable[[int], object]] = {
-            "ours": lambda n, f=ours: [f() for _ in range(n)],  # type: ignore[misc]
-            **{name: model.train for name, model in others.items()},
-        }
-        spent = _interleaved(runs, count)
-        mine = [1e3 * t / seeds for t in spent["ours"]]
+        runs: dict[str, Call] = {"ours": partial(_often, ours, count)}
+        runs |= {name: partial(model.train, count) for name, model in others.items()}
+        for run in runs.values():
+            run()
+        ms = {name: 1e3 * cost / count for name, cost in best(runs, repeats=REPEATS).items()}
         for name in others:
-            theirs = [1e3 * t for t in spent[name]]
             yield {
                 "name": f"TD3 update, {hidden}, {seeds} seed(s) / sb3 with {name}, per seed",
-                "ratio": round(min(theirs) / min(mine), 2),
-                "median_ratio": round(median(a / b for a, b in zip(theirs, mine, strict=True)), 2),
-                "ms": round(min(mine), 3),
-                "sb3_ms": round(min(theirs), 3),
+                "ratio": round(ms[name] * seeds / ms["ours"], 2),
+                "ms": round(ms["ours"] / seeds, 3),
+                "sb3_ms": round(ms[name], 3),
             }
-
-
-def _interleaved(runs: dict[str, Callable[[int], object]], count: int) -> dict[str, list[float]]:
-    """CPU seconds of one call's `count` updates, each; every repeat takes turns."""
-    spent: dict[str, list[float]] = {name: [] for name in runs}
-    for run in runs.values():
-        run(WARM_UP)
-    for _ in range(REPEATS):
-        for name, run in runs.items():
-            start = time.process_time()
-            run(count)
-            spent[name].append((time.process_time() - start) / count)
-    return spent
 
 
 def _trainer(study: Study, method: str) -> Any:
@@ -159,20 +149,19 @@ def _trainer(study: Study, method: str) -> Any:
 
 def _trainings() -> Iterator[dict[str, Any]]:
     trainers = {f"{study.name} {method}": _trainer(study, method) for study, method in CASES}
-    spent: dict[str, list[float]] = {name: [] for name in trainers}
+    lowest = dict.fromkeys(trainers, np.inf)
     for _ in range(BLOCKS):
         for name, trainer in trainers.items():
             before, start = trainer.steps, time.process_time()
             while trainer.steps < before + STEPS:
                 trainer.segment()
-            steps = SEEDS * (trainer.steps - before)
-            spent[name].append(1e3 * (time.process_time() - start) / steps)
-    for name, ms in spent.items():
+            spent = 1e3 * (time.process_time() - start) / (SEEDS * (trainer.steps - before))
+            lowest[name] = min(lowest[name], spent)
+    for name, ms in lowest.items():
         yield {
             "name": f"{name}, {SEEDS} seeds: {AIM_MS} ms / all-in CPU of a step and seed",
-            "ratio": round(AIM_MS / min(ms), 2),
-            "ms": round(min(ms), 3),
-            "median_ms": round(median(ms), 3),
+            "ratio": round(AIM_MS / ms, 2),
+            "ms": round(ms, 3),
         }
 
 

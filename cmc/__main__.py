@@ -6,6 +6,7 @@ This is the only place where learning and pictures meet.
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -15,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from cmc import store
-from cmc.studies import registry
+from cmc import results, store, studies
 from cmc.studies.study import Study
 
 
@@ -44,63 +44,53 @@ def _parser() -> argparse.ArgumentParser:
     def command(name: str, run: Callable[[argparse.Namespace], None], text: str) -> Any:
         made = commands.add_parser(name, help=text)
         made.set_defaults(run=run)
-        return made
-
-    def of_study(name: str, run: Callable[[argparse.Namespace], None], text: str) -> Any:
-        made = command(name, run, text)
-        made.add_argument("study", help="see `list`")
-        made.add_argument("--method", help="one method; all that fit if left out")
-        return made
+        if name != "list":
+            made.add_argument("study", help="see `list`")
+        if name in ("train", "evaluate", "play"):
+            made.add_argument("--method", help="one method; all that fit if left out")
+        return made.add_argument
 
     command("list", _list, "studies, their methods, and what is shipped")
-    train = of_study("train", _train, "train a method; goes on with an interrupted run")
-    train.add_argument("--seeds", type=int, default=5, help="number of seeds (default 5)")
-    length = train.add_mutually_exclusive_group()
-    length.add_argument("--steps", type=int, help="environment steps of each seed")
-    length.add_argument("--episodes", type=int, help="training episodes of each seed (peg_touch)")
-    train.add_argument("--jobs", type=int, default=1, help="trainings side by side (default 1)")
-    train.add_argument("--group", type=int, help="seeds of one job; all if left out")
-    train.add_argument("--backend", choices=("loky", "dask"), default="loky")
-    train.add_argument("--address", help="of a running Dask scheduler")
-    train.add_argument("--out", type=Path, help="folder of the run (default runs/STUDY)")
-    evaluate = of_study("evaluate", _evaluate, "test the shipped policies")
-    evaluate.add_argument("--trajectories", type=int, help="of the largest tests, fewer than usual")
-    evaluate.add_argument("--out", type=Path, help="folder that keeps finished tests")
-    evaluate.add_argument("--checkpoints", type=Path, help="folder; the shipped ones if left out")
-    evaluate.add_argument("--json", action="store_true", help="all rows as the last line")
+    train = command("train", _train, "train a method; goes on with an interrupted run")
+    train("--seeds", type=int, default=5, help="number of seeds (default 5)")
+    train("--steps", type=int, help="environment steps of each seed")
+    train("--episodes", type=int, help="training episodes of each seed (peg_touch)")
+    train("--jobs", type=int, default=1, help="trainings side by side (default 1)")
+    train("--group", type=int, help="seeds of one job; all if left out")
+    train("--backend", choices=("loky", "dask"), default="loky")
+    train("--address", help="of a running Dask scheduler")
+    train("--out", type=Path, help="folder of the run (default runs/STUDY)")
+    evaluate = command("evaluate", _evaluate, "test the shipped policies, or compute a table")
+    evaluate("--trajectories", type=int, help="of the largest tests, fewer than usual")
+    evaluate("--out", type=Path, help="folder that keeps finished tests, or the table")
+    evaluate("--checkpoints", type=Path, help="folder; the shipped ones if left out")
+    evaluate("--json", action="store_true", help="all rows as the last line")
     ship = command("ship", _ship, "test a run's policies; put them and their tables in the assets")
-    ship.add_argument("study", help="see `list`")
-    ship.add_argument("folder", type=Path, help="of the run")
-    ship.add_argument(
-        "--all",
-        nargs="*",
-        default=[],
-        metavar="METHOD",
-        dest="complete",
-        help="methods of which all kept policies are shipped, not only the last",
-    )
-    ship.add_argument("--assets", type=Path, default=Path("assets"))
-    play = of_study("play", _play, "write a picture or a 3D page of one test episode")
-    play.add_argument("--seed", type=int, default=0, help="which trained seed (default 0)")
-    play.add_argument("--episode", type=int, default=0, help="number of the test start")
-    play.add_argument("--checkpoint", type=Path, help="file; the shipped one if left out")
-    play.add_argument(
-        "--out", type=Path, help="file (default play.png, or play.html for 3D; .npz keeps arrays)"
-    )
-    play.add_argument("--live", action="store_true", help="a page in which the arm lives (3D)")
-    play.add_argument("--beside", metavar="METHOD", help="a second arm (--live); you set sub-goals")
+    ship("folder", type=Path, help="of the run")
+    text = "methods of which all kept policies are shipped, not only the last"
+    ship("--all", nargs="*", default=[], metavar="METHOD", dest="complete", help=text)
+    ship("--assets", type=Path, default=Path("assets"))
+    play = command("play", _play, "write a picture or a 3D page of one test episode")
+    play("--seed", type=int, default=0, help="which trained seed (default 0)")
+    play("--episode", type=int, default=0, help="number of the test start")
+    play("--checkpoint", type=Path, help="file; the shipped one if left out")
+    text = "file (default play.png, or play.html for 3D; .npz keeps arrays)"
+    play("--out", type=Path, help=text)
+    play("--live", action="store_true", help="a page in which the arm lives (3D)")
+    play("--beside", metavar="METHOD", help="a second arm (--live); you set sub-goals")
     return parser
 
 
 def _list(chosen: argparse.Namespace) -> None:
     from cmc.studies.runner import find
 
-    for name in registry.WHERE:
-        study = registry.get(name)
+    for name in studies.WHERE:
+        study = studies.get(name)
         print(f"{name}: {study.about}")
         for key, method in study.methods.items():
             there = "" if not method.trained or find(study, key).is_file() else "  (not shipped)"
             print(f"  {key:18} {method.title}{there}")
+    print("tables without a training: " + ", ".join(studies.TABLES))
 
 
 def _methods(study: Study, name: str | None) -> list[str]:
@@ -113,34 +103,31 @@ def _methods(study: Study, name: str | None) -> list[str]:
 
 def _train(chosen: argparse.Namespace) -> None:
     from cmc.studies.runner import train
+    from cmc.studies.sweep import sweep
 
-    study = registry.get(chosen.study)
+    study = studies.get(chosen.study)
     other = "episodes" if study.unit == "step" else "steps"
     if getattr(chosen, other) is not None:
         raise ValueError(f"--{other}: {study.name} counts {study.unit}s, use --{study.unit}s")
-    length = getattr(chosen, f"{study.unit}s")
-    for name, value in {"seeds": chosen.seeds, f"{study.unit}s": length}.items():
-        if value is not None and value < 1:
-            raise ValueError(f"--{name}: wanted at least 1, got {value}")
+    if chosen.address and chosen.backend != "dask":
+        raise ValueError("--address: only with --backend dask")
+    length, seeds = getattr(chosen, f"{study.unit}s"), range(chosen.seeds)
     methods = _methods(study, chosen.method)
     if chosen.jobs != 1 or chosen.group is not None or chosen.backend != "loky":
-        from cmc.studies.sweep import sweep
-
         options = {key: getattr(chosen, key) for key in ("jobs", "backend", "group", "address")}
-        seeds = range(chosen.seeds)
         made = sweep(study.name, methods, seeds, length=length, out=chosen.out, **options)
-        for method, path in zip(methods, made, strict=True):
-            print(f"{method}: {path}")
+        print("\n".join(f"{method}: {path}" for method, path in zip(methods, made, strict=True)))
         return
     for method in methods:
         with _bar(method, study.unit) as show:
 
             def report(row: dict[str, Any], show: Any = show) -> None:
-                show(row["done"], row["total"], _progress(study, row))
+                words, success = f"{study.gain} {np.mean(row['gain']):.3g}", row["success"]
+                if success is not None and np.isfinite(success).any():
+                    words = f"success {100 * np.nanmean(success):.0f} %, {words}"
+                show(row["done"], row["total"], words)
 
-            path = train(
-                study, method, range(chosen.seeds), length=length, out=chosen.out, callback=report
-            )
+            path = train(study, method, seeds, length=length, out=chosen.out, callback=report)
         print(f"{method}: {path}")
 
 
@@ -161,19 +148,18 @@ def _bar(title: str, unit: str) -> Iterator[Callable[[int, int, str], None]]:
         yield show
 
 
-def _progress(study: Study, report: dict[str, Any]) -> str:
-    """How well it goes, in a few words."""
-    words = f"{study.gain} {np.mean(report['gain']):.3g}"
-    success = report.get("success")
-    if success is None or not np.isfinite(success).any():
-        return words
-    return f"success {100 * np.nanmean(success):.0f} %, {words}"
-
-
 def _evaluate(chosen: argparse.Namespace) -> None:
     from cmc.studies.evaluation import evaluate, summary
 
-    study = registry.get(chosen.study)
+    if chosen.study in studies.TABLES:
+        data = importlib.import_module(f"cmc.studies.{chosen.study}").table()
+        seeds = sorted({int(seed) for seed in data["seed"]})
+        record = store.provenance(f"python -m cmc evaluate {chosen.study}", seeds)
+        folder = chosen.out or Path("runs") / chosen.study
+        print(data.to_string())
+        print(results.write(folder, "tests", data, {"study": chosen.study, **record}))
+        return
+    study = studies.get(chosen.study)
     names = None if chosen.method is None else _methods(study, chosen.method)
     with _bar(study.name, "test") as show:
         tables = evaluate(
@@ -184,15 +170,15 @@ def _evaluate(chosen: argparse.Namespace) -> None:
             checkpoints=chosen.checkpoints,
             progress=show,
         )
-    print("\n".join(summary(study, tables)))
+    print("\n".join(summary(tables)))
     if chosen.json:
         print(json.dumps(tables, allow_nan=False))
 
 
 def _ship(chosen: argparse.Namespace) -> None:
-    from cmc.studies.shipping import ship
+    from cmc.studies.evaluation import ship
 
-    study = registry.get(chosen.study)
+    study = studies.get(chosen.study)
     with _bar(study.name, "test") as show:
         made = ship(study, chosen.folder, chosen.assets, complete=chosen.complete, progress=show)
     for path in made:
@@ -200,9 +186,10 @@ def _ship(chosen: argparse.Namespace) -> None:
 
 
 def _play(chosen: argparse.Namespace) -> None:
+    from cmc.studies import recorded
     from cmc.studies.runner import load
 
-    study = registry.get(chosen.study)
+    study = studies.get(chosen.study)
     method = chosen.method or next(iter(study.methods))
     if chosen.live or chosen.beside:
         _live(study, method, chosen)
@@ -218,35 +205,30 @@ def _play(chosen: argparse.Namespace) -> None:
         raise ValueError(f"--out: wanted a {' or '.join(wanted)} file, got {out}")
     about = f"{study.name}, {study.method(method).title}, seed {found.seeds[0]}"
     motion |= {"text": f"{about}: {motion['text']}"}
-    if out.suffix == ".npz":
-        from cmc.studies import recorded
-
+    if out.suffix == ".png":
+        _picture(motion, out)
+    elif out.suffix == ".html":
+        _page(motion, out)
+    else:
         command = f"python -m cmc play {study.name} --method {method} --seed {chosen.seed}"
         command += f" --episode {chosen.episode} --out {out.name}"
-        made = store.provenance(command, found.seeds)
-        recorded.save(out, motion, {"study": study.name, "method": method, **made})
-    else:
-        (_page if out.suffix == ".html" else _picture)(motion, out)
+        record = {"study": study.name, "method": method}
+        recorded.save(out, motion, record | store.provenance(command, found.seeds))
     print(f"{motion['text']}\n{out}")
 
 
 def _live(study: Study, method: str, chosen: argparse.Namespace) -> None:
     """A page with MuJoCo in it: one arm under its planner, or two that take the same sub-goals."""
     from cmc.studies import live
-    from cmc.view.simulator import save_live_page
-    from cmc.view.style import METHOD_COLORS
+    from cmc.view.simulator import live_page
 
     first = [method] if chosen.beside is None else [method, chosen.beside]
-    names = [*first, *(name for name in live.playable(study) if name not in first)]
-    policies = live.live_policies(study, names)
-    for policy in policies:
-        policy["color"] = METHOD_COLORS[policy["name"]]
-    arms = [{"method": k, "kept": 0, "seed": chosen.seed} for k in range(len(first))]
-    title = " beside ".join(study.method(name).title for name in first)
-    out, task = chosen.out or Path("live.html"), live.live_task(study)
-    alone = chosen.beside is None
-    save_live_page(out, task, policies, title=f"{study.name}: {title}", arms=arms, plan=alone)
-    print(f"{study.name}: {title}\n{out}")
+    policies = live.live_policies(study, live.playable(study, first))
+    title = f"{study.name}: " + " beside ".join(study.method(name).title for name in first)
+    task, out = live.live_task(study), chosen.out or Path("live.html")
+    page = live_page(task, policies, title=title, arms=len(first), seed=chosen.seed).encode()
+    store.write_atomic(out, lambda file: file.write(page))
+    print(f"{title}\n{out}")
 
 
 def _picture(motion: dict[str, Any], out: Path) -> None:
@@ -265,6 +247,7 @@ def _page(motion: dict[str, Any], out: Path) -> None:
 
     from cmc.view.playback import Arrow, record
 
+    force = np.linalg.norm(motion["force"], axis=-1)
     recording = record(
         motion["model"],
         motion["qpos"],
@@ -273,10 +256,7 @@ def _page(motion: dict[str, Any], out: Path) -> None:
         trails=["tip"],
         markers=motion["markers"],
         arrows={"contact force": Arrow(motion["tip"], motion["force"])},
-        readouts={
-            "distance [mm]": 1e3 * motion["distance"],
-            "force [N]": np.linalg.norm(motion["force"], axis=-1),
-        },
+        readouts={"distance [mm]": 1e3 * motion["distance"], "force [N]": force},
     )
     views = dict(recording.cameras)
     near = {"task": views.pop("task")} if "task" in views else {}

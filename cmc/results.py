@@ -21,6 +21,12 @@ Columns of `tidy(study)`; other tables are described in `TABLES`:
 | episodes, trajectories | how many the row is about |
 | return | mean sum of rewards |
 | cost | low_level: mean cost of segments of the latent model (`cmc.learning.latent`) |
+| unstable, off, unstable_shifted, off_shifted | shares of tests, see `cmc.studies.own_plant` |
+| certified_m, cpu_s | half-width of the largest certified box, m; CPU time of a seed, s |
+| left_worst, left_mean | softness: share of a 5 mm step that is left after .4 s |
+| speed_x, impact_x_N, press_x_N, mass_x_kg | contact along x, see `cmc.studies.softness` |
+| speed_y, impact_y_N, press_y_N, mass_y_kg | the same along y |
+| force_999_N | softness: 99.9 % quantile of the largest force in a tick, N |
 | success, touched | share of episodes with the tip in the goal at the last tick, at any tick |
 | passed_by | share of episodes that touched and were elsewhere at the last tick |
 | nearest_mm, final_mm | median distance to the goal, smallest and at the end, mm |
@@ -38,6 +44,7 @@ Columns of `tidy(study)`; other tables are described in `TABLES`:
 | prediction | "weights" or "visited": from what oscillation is predicted |
 | predicted_oscillation, agreement | share predicted, and share of trajectories predicted rightly |
 | reachable | share of targets that the policy has an equilibrium for |
+| above_percent, rate | cost above that of the optimum, %; certified rate, 1/s (composition) |
 
 `data.attrs` is the record of the file: study, command, commit, versions. Columns that it names
 under `pooled` are known for all seeds together only and the same in each seed's row (but for tests
@@ -72,25 +79,18 @@ RESAMPLES = 9999
 
 
 def tidy(study: str, table: str = "tests") -> pd.DataFrame:
-    """A table of shipped results; the module's docstring lists the columns.
-
-    Args:
-        study: its name.
-        table: one of `TABLES`.
+    """A table, one of `TABLES`, of shipped results; the module's docstring lists the columns.
 
     Raises:
         ValueError: if there is no such table of this study, or the file is damaged.
     """
     if table not in TABLES:
         raise ValueError(f"table: wanted one of {', '.join(TABLES)}, got {table!r}")
-    try:
-        return read(store.asset("results", file_name(study, table)))
-    except FileNotFoundError:
-        there = {path.stem for path in store.asset("results").glob("*.csv")}
-        wanted = file_name(study, table)
-        raise ValueError(
-            f"no results {wanted!r} are shipped; there are {', '.join(sorted(there))}"
-        ) from None
+    wanted = file_name(study, table)
+    there = sorted(path.stem for path in store.asset("results").glob("*.csv"))
+    if wanted.removesuffix(".csv") not in there:
+        raise ValueError(f"no results {wanted!r} are shipped; there are {', '.join(there)}")
+    return read(store.asset("results", wanted))
 
 
 def file_name(study: str, table: str) -> str:
@@ -140,16 +140,13 @@ def at(
     return data[chosen & (data["h"] == h)] if "h" in data else data[chosen]
 
 
-def spread(
-    data: pd.DataFrame, key: str, by: str | Sequence[str] = "method", level: float = 0.95
-) -> pd.DataFrame:
-    """Mean over seeds of a figure, its bootstrap interval, smallest and largest seed.
+def spread(data: pd.DataFrame, key: str, by: str | Sequence[str] = "method") -> pd.DataFrame:
+    """Mean over seeds of a figure, its 95 % bootstrap interval, smallest and largest seed.
 
     Args:
         data: one row for each seed in each group.
         key: the figure's column.
         by: columns that make the groups.
-        level: of the interval.
 
     Returns:
         By group `mean`, `low`, `high` (percentile bootstrap over seeds; NaN for one seed), `least`,
@@ -165,39 +162,33 @@ def spread(
             f"wanted one row for each seed in a group by {', '.join(keys)}, got several: choose "
             "policies and tests first (`at`), or add columns to `by`"
         )
-    found = {group: _summary(rows[key], level) for group, rows in data.groupby(by, sort=False)}
+    found = {}
+    for group, rows in data.groupby(by, sort=False):
+        x = rows[key].to_numpy(float)
+        low, high = _bootstrap((x,), np.mean)
+        found[group] = {"mean": x.mean(), "low": low, "high": high}
+        found[group] |= {"least": x.min(), "largest": x.max(), "seeds": len(x)}
     answer = pd.DataFrame.from_dict(found, orient="index")
     answer.index.names = keys
     return answer.astype({"seeds": int}) if found else answer
 
 
 def share(
-    data: pd.DataFrame,
-    key: str = "success",
-    by: str | Sequence[str] = "method",
-    level: float = 0.95,
+    data: pd.DataFrame, key: str = "success", by: str | Sequence[str] = "method"
 ) -> pd.DataFrame:
     """`spread` of a share, in percent."""
-    answer = spread(data, key, by, level)
+    answer = spread(data, key, by)
     answer.loc[:, "mean":"largest"] *= 100.0  # type: ignore[misc]
     return answer
 
 
-def against(
-    data: pd.DataFrame, arm: str, other: str, key: str = "success", level: float = 0.95
-) -> pd.Series:
-    """One method's mean over seeds minus another's.
-
-    Args:
-        data: one row for each method and seed.
-        arm: a method.
-        other: the one that it is compared with.
-        key: the figure's column.
-        level: of the interval.
+def against(data: pd.DataFrame, arm: str, other: str, key: str = "success") -> pd.Series:
+    """One method's mean over seeds of a figure, minus another's; `data` has a row for each seed.
 
     Returns:
-        `difference`, `low`, `high` (percentile bootstrap over both methods' seeds) and `p`, exact
-        and two-sided: the share of all ways to deal the seeds to two methods that differ as much.
+        `difference`, `low`, `high` (95 %, percentile bootstrap over both methods' seeds) and `p`,
+        exact and two-sided: the share of all ways to deal the seeds to two methods that differ as
+        much.
 
     Raises:
         ValueError: if a method is missing, or one of its seeds has several rows.
@@ -206,30 +197,25 @@ def against(
     for name in (arm, other):
         rows = data[data["method"] == name].dropna(subset=[key])
         if rows.empty:
-            raise ValueError(
-                f"no {key} of {name!r}; there are {', '.join(data['method'].unique())}"
-            )
+            there = ", ".join(data["method"].unique())
+            raise ValueError(f"no {key} of {name!r}; there are {there}")
         if rows["seed"].duplicated().any():
             raise ValueError(f"{name}: wanted one row for each seed, got several (`at` chooses)")
         pair.append(rows[key].to_numpy(float))
     a, b = pair
-    low, high = np.nan, np.nan
-    if min(len(a), len(b)) > 1:
-        low, high = _bootstrap((a, b), _gap, level)
+    low, high = _bootstrap((a, b), _gap)
     p = stats.permutation_test((a, b), _gap, vectorized=True, n_resamples=np.inf).pvalue
     return pd.Series({"difference": a.mean() - b.mean(), "low": low, "high": high, "p": float(p)})
 
 
-def compare(
-    data: pd.DataFrame, comparisons: Iterable[tuple[str, str, str]], level: float = 0.95
-) -> pd.DataFrame:
+def compare(data: pd.DataFrame, comparisons: Iterable[tuple[str, str, str]]) -> pd.DataFrame:
     """`against` for comparisons (arm, other, key) that were named before looking.
 
     Returns:
         A row for each, with `p_holm`: p-values corrected by Holm for all that are in the list.
     """
     named = list(comparisons)
-    answer = pd.DataFrame([against(data, *three, level=level) for three in named])
+    answer = pd.DataFrame([against(data, *three) for three in named])
     answer.index = pd.MultiIndex.from_tuples(named, names=["method", "other", "key"])
     return answer.assign(p_holm=holm(answer["p"]))
 
@@ -248,24 +234,10 @@ def _gap(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
     return np.asarray(a.mean(axis=axis) - b.mean(axis=axis))
 
 
-def _summary(values: pd.Series, level: float) -> dict[str, float]:
-    x = values.to_numpy(float)
-    low, high = _bootstrap((x,), np.mean, level) if len(x) > 1 else (np.nan, np.nan)
-    ends = {"least": x.min(), "largest": x.max(), "seeds": len(x)}
-    return {"mean": x.mean(), "low": low, "high": high, **ends}
-
-
-def _bootstrap(
-    samples: tuple[np.ndarray, ...], statistic: Any, level: float
-) -> tuple[float, float]:
-    """Percentile interval; the seeds of each sample are drawn with replacement."""
-    found = stats.bootstrap(
-        samples,
-        statistic,
-        vectorized=True,
-        n_resamples=RESAMPLES,
-        confidence_level=level,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return float(found.low), float(found.high)
+def _bootstrap(samples: tuple[np.ndarray, ...], statistic: Any) -> tuple[float, float]:
+    """95 % percentile interval; the seeds of each sample are drawn with replacement."""
+    if min(map(len, samples)) < 2:
+        return np.nan, np.nan
+    options: Any = {"vectorized": True, "n_resamples": RESAMPLES, "method": "percentile"}
+    found = stats.bootstrap(samples, statistic, rng=np.random.default_rng(0), **options)
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)

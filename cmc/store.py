@@ -32,11 +32,7 @@ class CheckpointError(ValueError):
 
 
 def asset(*parts: str) -> Path:
-    """Path of a shipped asset, in a checkout or in an installed wheel.
-
-    Raises:
-        FileNotFoundError: if no such asset is shipped.
-    """
+    """Path of a shipped asset, in a checkout or in an installed wheel, or FileNotFoundError."""
     package = Path(__file__).resolve().parent
     for root in (package / "assets", package.parent / "assets"):
         if root.joinpath(*parts).exists():
@@ -89,16 +85,14 @@ def alive(pid: int) -> bool:
 
 def write_json(path: str | Path, content: Mapping[str, Any]) -> Path:
     """Write `content` as JSON (NaN and infinity are refused), atomically."""
+    if not isinstance(content, Mapping):
+        raise ValueError(f"content: wanted an object of names and values, got {content!r}")
     text = json.dumps(content, indent=1, allow_nan=False) + "\n"
     return write_atomic(path, lambda file: file.write(text.encode()))
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        ValueError: if the file does not hold one JSON object.
-    """
+    """Read a JSON object; a ValueError if the file does not hold one."""
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
@@ -110,11 +104,8 @@ def read_json(path: str | Path) -> dict[str, Any]:
 
 def provenance(command: str, seeds: list[int]) -> dict[str, Any]:
     """What produced a file: the command, seeds, commit and versions."""
-    packages = ("numpy", "scipy", "torch", "mujoco", "gymnasium")
-    versions = {"python": platform.python_version()}
-    for name in packages:
-        if name in sys.modules:
-            versions[name] = metadata.version(name)
+    there = [n for n in ("numpy", "scipy", "torch", "mujoco", "gymnasium") if n in sys.modules]
+    versions = {"python": platform.python_version()} | {n: metadata.version(n) for n in there}
     return {"command": command, "seeds": seeds, "commit": _commit(), "versions": versions}
 
 
@@ -134,12 +125,7 @@ def _commit() -> str:
 def save_checkpoint(
     path: str | Path, tensors: Mapping[str, np.ndarray], record: Mapping[str, Any]
 ) -> Path:
-    """Write arrays and their JSON record as one safetensors file, atomically.
-
-    Args:
-        path: where to write; its folder is made.
-        tensors: name to array, all finite.
-        record: JSON record; must hold `study` and `method`.
+    """Write finite arrays and their JSON record as one safetensors file, atomically.
 
     Raises:
         ValueError: if an array is not finite or the record lacks `study` or `method`.
@@ -150,8 +136,9 @@ def save_checkpoint(
     if missing:
         raise ValueError(f"the checkpoint record lacks {sorted(missing)}")
     arrays = {name: np.ascontiguousarray(array) for name, array in tensors.items()}
-    if broken := _not_finite(arrays):
-        raise ValueError(f"tensor {broken!r} is not finite: nothing was written to {path}")
+    for name, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"tensor {name!r} is not finite: nothing was written to {path}")
     text = json.dumps(dict(record), allow_nan=False)
     header = {"format": _FORMAT, "record": text, "digest": _digest(arrays, text)}
     data = save(arrays, metadata=header)
@@ -161,15 +148,12 @@ def save_checkpoint(
 def load_checkpoint(
     path: str | Path, *, study: str | None = None, method: str | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read a checkpoint written by `save_checkpoint`.
+    """Arrays by name, and the record, from a file that `save_checkpoint` wrote.
 
     Args:
         path: the file.
         study: if given, the study it must belong to.
         method: if given, the method it must have been trained with.
-
-    Returns:
-        The arrays by name, and the record.
 
     Raises:
         CheckpointError: if it is missing, damaged, pickled, foreign or of another study/method.
@@ -188,34 +172,18 @@ def load_checkpoint(
             f"{path} is not a complete safetensors file ({error}); "
             "truncated, pickled and foreign files are refused"
         ) from error
-    if header.get("format") != _FORMAT:
-        raise CheckpointError(
-            f"{path}: wanted a file of format {_FORMAT!r}, found {header.get('format')!r}"
-        )
-    text = header.get("record", "")
-    # files of earlier versions carry no digest
-    if header.get("digest", "") not in ("", _digest(tensors, text)):
+    form, text = header.get("format"), header.get("record", "")
+    if form != _FORMAT:
+        raise CheckpointError(f"{path}: wanted a file of format {_FORMAT!r}, found {form!r}")
+    if header.get("digest") != _digest(tensors, text):
         raise CheckpointError(f"{path} is damaged: its content is not what was written")
-    if broken := _not_finite(tensors):
-        raise CheckpointError(f"{path} is damaged: tensor {broken!r} is not finite")
-    try:
-        record = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise CheckpointError(f"{path} is damaged: its record is not JSON: {error}") from error
-    if not (isinstance(record, dict) and {"study", "method"} <= set(record)):
-        raise CheckpointError(f"{path}: wanted a record of study and method, found {text[:80]!r}")
+    record: dict[str, Any] = json.loads(text)
     for key, wanted in (("study", study), ("method", method)):
         if wanted is not None and record[key] != wanted:
             raise CheckpointError(
                 f"{path}: wanted a checkpoint of {key} {wanted!r}, found {record[key]!r}"
             )
     return tensors, record
-
-
-def _not_finite(arrays: Mapping[str, np.ndarray]) -> str | None:
-    """Name of the first array that holds NaN or infinity, if there is one."""
-    floats = ((name, a) for name, a in arrays.items() if a.dtype.kind == "f")
-    return next((name for name, a in floats if not np.isfinite(a).all()), None)
 
 
 def _digest(arrays: Mapping[str, np.ndarray], record: str) -> str:

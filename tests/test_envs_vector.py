@@ -48,7 +48,7 @@ def test_next_step_resets_one_step_later_as_gymnasiums_own_vector_does(name):
 
 
 @pytest.mark.parametrize("name", SHORT)
-def test_same_step_hands_out_the_last_observation_and_disabled_goes_on(name):
+def test_same_step_hands_out_the_last_observation_and_disabled_waits_for_the_mask(name):
     same, still = make(name, "SameStep"), make(name, AutoresetMode.DISABLED)
     first, _ = same.reset(seed=0)
     still.reset(seed=0)
@@ -61,6 +61,10 @@ def test_same_step_hands_out_the_last_observation_and_disabled_goes_on(name):
     np.testing.assert_array_equal(np.stack(info["final_obs"]), last)
     assert np.abs(obs - last).max() > 0
     assert obs.shape == first.shape
+    anew, _ = still.reset(options={"reset_mask": np.array([True, False])})
+    np.testing.assert_array_equal(anew, np.stack([obs[0], last[1]]))
+    with pytest.raises(ValueError, match="reset_mask"):
+        still.reset(options={"reset_mask": np.ones(3)})
     with pytest.raises(ValueError, match="autoreset_mode: wanted one of NextStep, SameStep"):
         make(name, "never")
 
@@ -117,13 +121,13 @@ def test_reward_and_target_are_ones_own():
 
 
 def test_bad_plants_and_arguments_are_refused():
-    with pytest.raises(ValueError, match="h > 0"):
+    with pytest.raises(ValueError, match="h > 0 and room"):
         PlantEnv(h=0.0)
-    with pytest.raises(ValueError, match="horizon: wanted a whole number"):
+    with pytest.raises(ValueError, match="horizon needs a whole number"):
         PlantEnv(horizon=2.5)
-    with pytest.raises(ValueError, match=r"target: wanted shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"target needs shape \(2,\)"):
         PlantEnv(target=[1.0])
     env = PlantVectorEnv(2)
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="actions: wanted finite"):
+    with pytest.raises(ValueError, match="actions needs finite"):
         env.step(np.full((2, 2), np.nan))

@@ -104,7 +104,7 @@ def poses(count, seed=0):
     return np.random.default_rng(seed).uniform(panda.LOWER, panda.UPPER, (count, 7))
 
 
-def test_forward_kinematics_equals_the_table(scene):
+def test_kinematics_equal_the_table(scene):
     model, data = scene
     for q in poses(50):
         data.qpos[:] = q
@@ -118,9 +118,6 @@ def test_forward_kinematics_equals_the_table(scene):
         np.testing.assert_allclose(data.body("hand").xmat.reshape(3, 3), hand[:3, :3], atol=1e-12)
         tip = hand @ [0, 0, 0.1124 + PEG_LENGTH, 1]
         np.testing.assert_allclose(data.site("tip").xpos, tip[:3], atol=1e-12)
-        position, rotation = panda.forward_kinematics(q, panda.FINGERTIP + PEG_LENGTH)
-        np.testing.assert_allclose(position, tip[:3], atol=1e-12)
-        np.testing.assert_allclose(rotation, hand[:3, :3], atol=1e-12)
 
 
 def test_mass_matrix_gravity_and_coriolis_equal_an_independent_computation(scene):
@@ -160,7 +157,7 @@ def test_motors_clip_at_the_torque_limit(scene):
     data.qpos[:] = panda.READY
     data.ctrl[:] = 1e4
     mujoco.mj_forward(model, data)
-    np.testing.assert_array_equal(data.qfrc_actuator, panda.TORQUE_LIMIT)
+    np.testing.assert_array_equal(data.qfrc_actuator, [87] * 4 + [12] * 3)
 
 
 def test_only_the_peg_collides(scene):
@@ -187,12 +184,14 @@ def test_inverse_kinematics_reaches_the_pose_and_says_when_it_cannot():
     chain = frames(q)[7]
     np.testing.assert_allclose(chain @ [0, 0, 0.1624, 1], [0.42, -0.02, 0.01, 1], atol=1e-8)
     np.testing.assert_allclose(chain[:3, :3], np.diag([1, -1, -1]), atol=1e-8)
-    with pytest.raises(panda.UnreachableError, match="m and"):
+    with pytest.raises(ValueError, match="m and"):
         panda.inverse_kinematics([1.4, 0, 0])
     with pytest.raises(ValueError, match="finite"):
         panda.inverse_kinematics([np.nan, 0, 0])
-    with pytest.raises(ValueError, match="wanted"):
+    with pytest.raises(ValueError, match=r"position needs shape \(3,\)"):
         panda.inverse_kinematics([0.4, 0.0])
+    with pytest.raises(ValueError, match="length of quat needs positive"):
+        panda.inverse_kinematics([0.42, -0.02, 0.01], [0, 0, 0, 0])
 
 
 def test_the_compliant_mount_is_two_springs_and_the_same_tip():
@@ -212,14 +211,14 @@ def test_the_compliant_mount_is_two_springs_and_the_same_tip():
 
 
 def test_bad_scenes_and_pegs_are_refused(tmp_path):
-    with pytest.raises(panda.SceneError, match="neither a file nor a shipped scene"):
+    with pytest.raises(ValueError, match="neither a file nor a shipped scene"):
         panda.load_scene("nowhere.xml")
     broken = tmp_path / "broken.xml"
     broken.write_text("<mujoco><worldbody>")
-    with pytest.raises(panda.SceneError, match="does not parse"):
+    with pytest.raises(ValueError, match="does not parse"):
         panda.load_scene(broken)
     broken.write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
-    with pytest.raises(panda.SceneError, match="holds no peg"):
+    with pytest.raises(ValueError, match="holds no peg"):
         panda.load_scene(broken)
     with pytest.raises(ValueError, match="physics step"):
         panda.load_scene(timestep=0.02)

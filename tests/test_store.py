@@ -22,7 +22,7 @@ TENSORS = {
 }
 
 
-def test_checkpoint_round_trip_is_exact(tmp_path: Path) -> None:
+def test_a_round_trip_is_exact_and_another_study_or_method_refused(tmp_path: Path) -> None:
     path = store.save_checkpoint(tmp_path / "deep" / "a.safetensors", TENSORS, RECORD)
     tensors, record = store.load_checkpoint(path, study="peg_touch", method="cppo")
     assert record == RECORD
@@ -30,13 +30,9 @@ def test_checkpoint_round_trip_is_exact(tmp_path: Path) -> None:
     for name, array in TENSORS.items():
         assert tensors[name].dtype == array.dtype
         np.testing.assert_array_equal(tensors[name], array)
-
-
-@pytest.mark.parametrize(("key", "value"), [("study", "peg_push"), ("method", "ppo")])
-def test_a_checkpoint_of_something_else_is_refused(tmp_path: Path, key: str, value: str) -> None:
-    path = store.save_checkpoint(tmp_path / "a.safetensors", TENSORS, RECORD)
-    with pytest.raises(store.CheckpointError, match=f"wanted a checkpoint of {key} '{value}'"):
-        store.load_checkpoint(path, **{key: value})
+    for key, value in (("study", "peg_push"), ("method", "ppo")):
+        with pytest.raises(store.CheckpointError, match=f"a checkpoint of {key} '{value}'"):
+            store.load_checkpoint(path, **{key: value})
 
 
 def test_foreign_files_are_refused(tmp_path: Path) -> None:
@@ -47,21 +43,16 @@ def test_foreign_files_are_refused(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(data)
         with pytest.raises(store.CheckpointError, match="not a complete safetensors file"):
             store.load_checkpoint(tmp_path / name)
+    header = {"format": "cmc-checkpoint-1", "record": json.dumps(RECORD)}
+    for extra in ({}, {"digest": "0" * 64}):  # nothing is read that was not written here
+        (tmp_path / "other").write_bytes(save(TENSORS, metadata={**header, **extra}))
+        with pytest.raises(store.CheckpointError, match="not what was written"):
+            store.load_checkpoint(tmp_path / "other")
     (tmp_path / "foreign").write_bytes(save(TENSORS))
     with pytest.raises(store.CheckpointError, match="wanted a file of format"):
         store.load_checkpoint(tmp_path / "foreign")
     with pytest.raises(store.CheckpointError, match="no checkpoint at"):
         store.load_checkpoint(tmp_path / "missing")
-
-
-@pytest.mark.parametrize("record", ["", "[1]", "{", '"x"', '{"study": "peg_touch"}'])
-def test_a_record_that_is_none_is_refused(tmp_path: Path, record: str) -> None:
-    from safetensors.numpy import save
-
-    path = tmp_path / "a.safetensors"
-    path.write_bytes(save(TENSORS, metadata={"format": "cmc-checkpoint-1", "record": record}))
-    with pytest.raises(store.CheckpointError, match=r"a\.safetensors"):
-        store.load_checkpoint(path)
 
 
 def test_every_single_damage_is_a_checkpoint_error(tmp_path: Path) -> None:
@@ -79,17 +70,6 @@ def test_every_single_damage_is_a_checkpoint_error(tmp_path: Path) -> None:
             assert record == RECORD  # what is read is what was written, if it is read at all
             for name, array in TENSORS.items():
                 np.testing.assert_array_equal(tensors[name], array)
-
-
-def test_files_without_a_digest_are_read_and_must_be_finite(tmp_path: Path) -> None:
-    from safetensors.numpy import save
-
-    path, header = tmp_path / "a", {"format": "cmc-checkpoint-1", "record": json.dumps(RECORD)}
-    path.write_bytes(save(TENSORS, metadata=header))
-    assert store.load_checkpoint(path)[1] == RECORD
-    path.write_bytes(save({"w": np.array([1.0, np.inf])}, metadata=header))
-    with pytest.raises(store.CheckpointError, match="'w' is not finite"):
-        store.load_checkpoint(path)
 
 
 def test_files_are_as_open_as_the_umask_says(tmp_path: Path) -> None:

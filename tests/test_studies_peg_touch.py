@@ -9,24 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from cmc.studies import peg_touch, peg_touch_caps, registry
+from cmc import studies
+from cmc.studies import peg_touch
 from cmc.studies.evaluation import evaluate
 from cmc.studies.peg_touch import METHODS, STUDY, change
-from cmc.studies.peg_touch_tests import (
-    SHIFTS,
-    TestConfig,
-    equilibrium,
-    measure,
-    own_slopes,
-    record,
-    shifted,
-    simulate,
-)
+from cmc.studies.peg_touch_tests import SHIFTS, detect, equilibrium, measure, record
 from cmc.studies.runner import load, train
-from cmc.theory.sampled import sampled_margin
+from cmc.theory.sampled import hold_lag, sampled_margin
 
 TRAINED = [name for name, method in METHODS.items() if method.trained]
-FEW = TestConfig(trajectories=64)
+CAPS = studies.get("peg_touch_caps")
 
 
 def untrained(study, name, seeds):
@@ -46,20 +38,18 @@ def test_every_method_trains_and_one_seed_acts_as_among_others(name: str, tmp_pa
 def test_one_seed_is_tested_like_all_of_them(tmp_path: Path) -> None:
     path = train(STUDY, "cppo_bounded", [3, 5], length=32, out=tmp_path)
     task = STUDY.config_of("cppo_bounded").task
-    both = record(load(STUDY, "cppo_bounded", path=path).policy, task, FEW, 2)
+    both = record(load(STUDY, "cppo_bounded", path=path).policy, task, 64, 2)
     for seed in range(2):
         policy = load(STUDY, "cppo_bounded", seed=seed, path=path).policy
-        alone = record(policy, task, FEW, 1)
+        alone = record(policy, task, 64)
         np.testing.assert_allclose(alone.returns[0], both.returns[seed], rtol=1e-4)
-    run = simulate(policy, task, num=3, duration=0.1)
-    assert run["e_x"].shape == (10, 3)
 
 
 @pytest.mark.parametrize("name", ["pi", "pi_scaled"])
 @pytest.mark.parametrize("shift", list(SHIFTS))
 def test_prediction_meets_measurement_for_known_gains(name: str, shift: str) -> None:
     config = change(shift)(STUDY.config_of(name))
-    found = measure(untrained(STUDY, name, [0]), config.task, TestConfig(trajectories=500), 1)
+    found = measure(untrained(STUDY, name, [0]), config.task, 500, 1)
     (row,) = found["tests"]
     assert row["prediction"] == "weights"
     assert row["agreement"] >= 0.98
@@ -71,7 +61,7 @@ def test_prediction_meets_measurement_for_known_gains(name: str, shift: str) -> 
 
 def test_the_equilibrium_of_fixed_gains_is_the_one_on_paper() -> None:
     policy, task = untrained(STUDY, "pi", [0]), STUDY.config.task
-    envs = record(policy, task, FEW, 1).envs
+    envs = record(policy, task, 64).envs
     s, exists = equilibrium(policy, envs, 1)
     assert exists.all()
     gains = policy.network.gains.numpy()
@@ -80,26 +70,11 @@ def test_the_equilibrium_of_fixed_gains_is_the_one_on_paper() -> None:
     np.testing.assert_allclose(s[0, :, 1, 1], (-0.5 - z_d) / gains[1, 1], atol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["cppo", "ppo_joint", "convex_pi", "cppo_no_integral"])
-def test_own_slopes_are_differences_of_the_command(name: str) -> None:
-    policy, eps = untrained(STUDY, name, [0]).double(), 1e-5
-    s = torch.randn(1, 7, 2, 2, dtype=torch.float64)
-    found = own_slopes(policy, s)
-    for i in range(2):
-        for j in range(2):
-            step = torch.zeros_like(s)
-            step[..., i, j] = eps
-            up, down = (policy((s + sign * step).flatten(-2)) for sign in (1, -1))
-            difference = -(up - down)[..., i] / (2 * eps)  # the sign rule
-            torch.testing.assert_close(found[..., i, j], difference, rtol=1e-3, atol=1e-6)
-    assert own_slopes(untrained(STUDY, "ppo_raw", [0]), s) is None
-
-
 # -- caps: whatever the weights, the sampled loop of the worst plant of the design is stable --
 
 CAPPED = [
     *((STUDY, name) for name in ("cppo_capped", "cppo_bypass", "cppo_scaled", "cppo_bounded")),
-    *((peg_touch_caps.STUDY, n) for n in peg_touch_caps.METHODS if not n.startswith("none")),
+    *((CAPS, name) for name in CAPS.methods if not name.startswith("none")),
 ]
 
 
@@ -128,14 +103,14 @@ def test_the_worst_sampled_loop_is_stable_for_any_weights(study, name: str) -> N
 
 
 def test_without_a_cap_some_weights_are_unstable() -> None:
-    policy = untrained(peg_touch_caps.STUDY, "none", [0])
+    policy = untrained(CAPS, "none", [0])
     slope = policy.jacobian(torch.zeros(1, 1, 2, 2)).detach().double().numpy()
-    assert (worst_margin(peg_touch_caps.STUDY.config, slope) < 0).any()
+    assert (worst_margin(CAPS.config, slope) < 0).any()
 
 
 def test_noise_starts_where_a_variant_says() -> None:
-    training = peg_touch_caps.STUDY.build("joint_quiet", [0, 1])
-    torch.testing.assert_close(training.ppo.log_std[:, 0], torch.tensor([[-1.0, -3.0]] * 2))
+    training = CAPS.build("joint_quiet", [0, 1])
+    torch.testing.assert_close(training.log_std[:, 0], torch.tensor([[-1.0, -3.0]] * 2))
 
 
 # -- tables ----------------------------------------------------------------------------------
@@ -163,13 +138,93 @@ def test_tables_say_what_was_tested(tmp_path: Path) -> None:
 
 
 def test_another_control_period_keeps_durations() -> None:
-    slow, fast = STUDY.config, registry.get("peg_touch_2ms").config
+    slow, fast = STUDY.config, studies.get("peg_touch_2ms").config
     assert fast.task.h * fast.task.horizon == pytest.approx(slow.task.h * slow.task.horizon)
     assert fast.ppo.steps == fast.task.horizon
     assert fast.ppo.gamma**fast.task.horizon == pytest.approx(slow.ppo.gamma**slow.task.horizon)
 
 
-def test_unknown_shifts_are_named() -> None:
-    with pytest.raises(ValueError, match="unknown shift 'gravity'"):
-        shifted(STUDY.config.task, "gravity")
+def test_the_paper_tests_one_kept_policy() -> None:
     assert peg_touch.paper([1000, 5000, 9000]) == [5000]
+    assert peg_touch.paper([16, 32]) == [32]
+
+
+# -- detectors: on signals whose answer is known, and against the bound of sampled loops -----------
+
+H = 0.01
+T = np.arange(200) * H
+QUIET = np.zeros_like(T)
+
+
+def verdict_of(x, f=QUIET):
+    answer = detect(np.stack([x, f], axis=-1)[:, None], H)
+    found = [name for name, flag in answer.items() if flag[0]]
+    assert len(found) <= 1
+    return found[0] if found else "converged"
+
+
+@pytest.mark.parametrize(
+    ("x", "f", "wanted"),
+    [
+        (QUIET, QUIET, "converged"),
+        (np.exp(-T / 0.05), 2 * np.exp(-T / 0.1), "converged"),
+        (0.1 * np.sin(30 * T), QUIET, "oscillation"),
+        (0.005 * np.sin(30 * T), QUIET, "converged"),
+        (np.exp(-5 * T) * np.sin(30 * T), QUIET, "converged"),
+        (QUIET, 0.3 * np.sin(40 * T), "oscillation"),
+        (0.1 * T, QUIET, "drift"),
+        (0.5 - 0.1 * T, QUIET, "offset"),
+        (QUIET, 0.5 + QUIET, "offset"),
+        (0.1 * T, 0.3 * np.sin(40 * T), "oscillation"),
+        (QUIET, np.where(np.arange(200) % 2 == 0, 0.2, -0.2), "oscillation"),
+    ],
+)
+def test_signals_with_a_known_answer(x, f, wanted):
+    assert verdict_of(x, f) == wanted
+
+
+def simulate(k1, k2, tau, K, steps=300):
+    """Sampled loops e_{k+1} = phi e_k - G (k1 e_k + k2 I_k), clipped as an actuator would."""
+    phi, G = hold_lag(-1 / tau, K / tau, H)
+    e, integral = np.ones_like(K), np.zeros_like(K)
+    path = []
+    for _ in range(steps):
+        path.append(e)
+        integral = integral + H * e
+        e = phi * e + G * np.clip(-(k1 * e + k2 * integral), -3.0, 3.0)
+    return np.array(path)
+
+
+def test_oscillation_agrees_with_the_sampled_bound():
+    rng = np.random.default_rng(0)
+    n = 20_000
+    tau, K = rng.uniform(0.005, 0.05, n), rng.uniform(1.0, 60.0, n)
+    k1 = rng.uniform(0.2, 2.0, n) / (np.tanh(H / (2 * tau)) * K)
+    k2 = rng.uniform(0.2, 0.5, n) / (K * tau)  # quick enough to settle within the test
+    path = simulate(k1, k2, tau, K)
+    measured = detect(np.stack([path, np.zeros_like(path)], axis=-1), H)["oscillation"]
+    margin = sampled_margin(k1, k2, tau, K, H)
+    assert np.mean(measured == (margin < 0)) > 0.98
+    assert 0.1 < measured.mean() < 0.9
+
+
+def test_a_wrong_sign_of_the_integral_drifts():
+    n = 50
+    tau, K = np.full(n, 0.02), np.linspace(1.0, 20.0, n)
+    path = 10.0 * simulate(0.2 / K, -0.5 / K, tau, K)
+    verdict = detect(np.stack([path, np.zeros_like(path)], axis=-1), H)
+    assert not verdict["oscillation"].any()
+    assert verdict["drift"].mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (np.zeros((50, 1, 2)), "no shorter"),
+        (np.zeros((200, 1, 3)), "wanted"),
+        (np.full((200, 1, 2), np.nan), "finite"),
+    ],
+)
+def test_bad_records_are_refused(error, message):
+    with pytest.raises(ValueError, match=message):
+        detect(error, H)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -17,12 +18,11 @@ import pytest
 import torch
 from torch import nn
 
-from cmc import results, store
-from cmc.studies import registry
-from cmc.studies.evaluation import evaluate, summary
+from cmc import results, store, studies
+from cmc.studies.evaluation import evaluate, ship, summary
 from cmc.studies.runner import load, marks_of, train
-from cmc.studies.shipping import merge, ship
 from cmc.studies.study import Method, Study, Test, before_last, last
+from cmc.studies.sweep import merge, sweep
 
 
 @dataclass(frozen=True)
@@ -146,30 +146,19 @@ def test_a_stopped_run_goes_on_to_the_same_end(
     same_files(path, whole)
 
 
-def test_a_finished_run_can_be_made_longer(whole: Path, tmp_path: Path) -> None:
-    train(TOY, "walk", [3, 5], length=60, out=tmp_path)
-    same_files(train(TOY, "walk", [3, 5], out=tmp_path), whole)
-
-
-@pytest.mark.parametrize(
-    ("method", "seeds", "study", "message"),
-    [
-        ("walk", [3], TOY, r"is a run of seeds \[3, 5\], not \[3\]: use another folder \(--out\)"),
-        ("walk", [3, 5], TOY.variant("toy", "", step=0.2), "another configuration: use another"),
-    ],
-)
-def test_a_run_of_something_else_is_not_touched(
-    whole: Path, tmp_path: Path, method: str, seeds: list[int], study: Study, message: str
-) -> None:
+def test_a_run_of_something_else_is_not_touched(tmp_path: Path) -> None:
     path = train(TOY, "walk", [3, 5], out=tmp_path)
     before = path.read_bytes()
-    with pytest.raises(store.CheckpointError, match=message):
-        train(study, method, seeds, out=tmp_path)
+    with pytest.raises(store.CheckpointError, match=r"is a run of seeds \[3, 5\], not \[3\]: use"):
+        train(TOY, "walk", [3], out=tmp_path)
+    with pytest.raises(store.CheckpointError, match=r"another configuration: use .* \(--out\)"):
+        train(TOY.variant("toy", "", step=0.2), "walk", [3, 5], out=tmp_path)
     assert path.read_bytes() == before
 
 
 def test_a_file_without_its_partner_never_mislabels_a_curve(whole: Path, tmp_path: Path) -> None:
     path = train(TOY, "walk", [3, 5], length=60, out=tmp_path)
+    same_files(train(TOY, "walk", [3, 5], out=tmp_path), whole)  # made longer
     path.unlink()  # a state alone is begun anew
     same_files(train(TOY, "walk", [3, 5], out=tmp_path), whole)
     (tmp_path / "walk_state.safetensors").unlink()  # policies alone are not overwritten
@@ -188,7 +177,11 @@ def test_wrong_requests_are_named(whole: Path, tmp_path: Path) -> None:
         (lambda: load(TOY, "walk", seed=2, path=whole), "seed: wanted a position from 0 to 1"),
         (lambda: load(TOY, "fast", path=whole), "wanted a checkpoint of method 'fast'"),
         (lambda: evaluate(TOY, trajectories=0), "trajectories: wanted at least 1"),
-        (lambda: registry.get("toy"), "unknown study 'toy'; wanted one of peg_touch"),
+        (lambda: studies.get("toy"), "unknown study 'toy'; wanted one of peg_touch"),
+        (lambda: sweep("peg_touch", ["sac"], [0]), "unknown method 'sac'"),
+        (lambda: sweep("peg_touch", ["cppo"], []), "seeds: wanted at least 1"),
+        (lambda: sweep("peg_touch", ["cppo"], [0], jobs=0), "jobs: wanted at least 1"),
+        (lambda: sweep("peg_touch", ["cppo"], [0], backend="mpi"), "wanted 'loky' or 'dask'"),
     ):
         with pytest.raises(ValueError, match=message):
             call()
@@ -215,7 +208,7 @@ def test_tests_are_made_once_and_carry_what_they_are_about(whole: Path, tmp_path
     assert [r["reward"] for r in tables["curves"]] == list(
         store.load_checkpoint(whole)[0]["rewards"].astype(float).ravel()
     )
-    assert summary(TOY, tables)[0].startswith("Walk: return ")
+    assert summary(tables)[0].startswith("Walk: return ")
     few = evaluate(TOY, ["walk"], trajectories=10, **options)["tests"]
     assert {r["number"] for r in few} == {10, 2, 5}
 
@@ -259,9 +252,7 @@ def test_groups_of_seeds_put_together_are_the_whole(whole: Path, tmp_path: Path)
 @pytest.mark.parametrize("backend", ["loky", "dask"])
 def test_a_sweep_in_groups_is_the_training_of_all(tmp_path: Path, backend: str) -> None:
     pytest.importorskip("distributed" if backend == "dask" else "joblib")
-    from cmc.studies.sweep import sweep
-
-    study = registry.get("peg_touch")
+    study = studies.get("peg_touch")
     options: Any = {"length": 32, "group": 1, "jobs": 2, "backend": backend}
     (path,) = sweep("peg_touch", ["cppo"], [0, 4], out=tmp_path / "sweep", **options)
     at_once = store.load_checkpoint(train(study, "cppo", [0, 4], length=32, out=tmp_path))[0]
@@ -269,33 +260,19 @@ def test_a_sweep_in_groups_is_the_training_of_all(tmp_path: Path, backend: str) 
         np.testing.assert_allclose(found, at_once[key], rtol=1e-4, atol=1e-6)
 
 
-def test_wrong_sweeps_are_named() -> None:
-    from cmc.studies.sweep import sweep
-
-    for options, message in (
-        ({"names": ["sac"]}, "unknown method 'sac'"),
-        ({"seeds": []}, "seeds: wanted at least 1"),
-        ({"jobs": 0}, "jobs: wanted at least 1"),
-        ({"backend": "mpi"}, "backend: wanted 'loky' or 'dask'"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            sweep(**{"study": "peg_touch", "names": ["cppo"], "seeds": [0], **options})  # type: ignore[arg-type]
-
-
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="reads /proc")
 def test_a_killed_sweep_leaves_no_process(tmp_path: Path) -> None:
-    def of_the_sweep() -> list[str]:
+    mark = f"SWEEP_OF_A_TEST={tmp_path.name}".encode()
+
+    def of_the_sweep() -> list[Path]:
         """Processes that carry the mark of this test in their environment."""
         found = []
-        for entry in Path("/proc").iterdir():
-            try:
-                if entry.name.isdigit() and mark.encode() in (entry / "environ").read_bytes():
-                    found.append(entry.name)
-            except OSError:
-                continue
+        for entry in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):
+                if mark in (entry / "environ").read_bytes():
+                    found.append(entry)
         return found
 
-    mark = f"SWEEP_OF_A_TEST={tmp_path.name}"
     command = ["train", "peg_touch", "--method", "cppo", "--seeds", "2", "--group", "1"]
     process = subprocess.Popen(
         [sys.executable, "-m", "cmc", *command, "--jobs", "2", "--out", str(tmp_path)],

@@ -9,16 +9,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cmc import results, store
-from cmc.studies import recorded, registry
+from cmc import results, store, studies
+from cmc.studies import recorded
 from cmc.studies.runner import find, load, marks_of, train
 from cmc.studies.study import Test
 
 FOLDER = store.asset("checkpoints")
 SHIPPED = [
     (study, name)
-    for study in registry.WHERE
-    for name, method in registry.get(study).methods.items()
+    for study in studies.WHERE
+    for name, method in studies.get(study).methods.items()
     if method.trained and (FOLDER / f"{study}_{name}.safetensors").is_file()
 ]
 
@@ -32,20 +32,20 @@ def test_every_shipped_file_belongs_to_a_study() -> None:
 
 @pytest.mark.parametrize(("study", "name"), SHIPPED)
 def test_every_shipped_policy_loads_and_has_its_rows(study: str, name: str) -> None:
-    path = find(registry.get(study), name)
+    path = find(studies.get(study), name)
     tensors, record = store.load_checkpoint(path, study=study, method=name)
     assert store.read_json(path.with_suffix(".json")) == record
     assert f"train {study} --method {name}" in record["command"]
     assert "+changes" not in record["commit"] or study == "peg_touch"  # an early run
     marks = marks_of(tensors)
     for mark in (marks[0], marks[-1]):
-        assert load(registry.get(study), name, mark).seeds == record["seeds"]
+        assert load(studies.get(study), name, mark).seeds == record["seeds"]
     data = results.tidy(study)
     rows = data[data["method"] == name]
     assert list(rows["seed"].unique()) == record["seeds"]
-    assert set(rows.loc[rows["last"], registry.get(study).unit]) == {marks[-1]}
+    assert set(rows.loc[rows["last"], studies.get(study).unit]) == {marks[-1]}
     curve = results.tidy(study, "curves")
-    gain = registry.get(study).gain
+    gain = studies.get(study).gain
     mean = curve.loc[curve["method"] == name, gain].mean()
     assert mean == pytest.approx(tensors[f"{gain}s"].mean(), rel=0.1)
 
@@ -53,7 +53,7 @@ def test_every_shipped_policy_loads_and_has_its_rows(study: str, name: str) -> N
 @pytest.mark.parametrize("name", ["cppo", "ppo", "cppo_bounded"])
 def test_shipped_runs_begin_as_the_present_code_does(name: str, tmp_path: Path) -> None:
     """The first updates of one seed, trained again alone, are those of the shipped five."""
-    study = registry.get("peg_touch")
+    study = studies.get("peg_touch")
     path = train(study, name, [0], length=32, out=tmp_path)
     found, wanted = (store.load_checkpoint(p)[0]["returns"] for p in (path, find(study, name)))
     np.testing.assert_allclose(found[:2, 0], wanted[:2, 0], rtol=1e-3)
@@ -69,7 +69,7 @@ def test_shipped_runs_begin_as_the_present_code_does(name: str, tmp_path: Path) 
 def test_the_present_code_gives_the_shipped_figures(
     study: str, name: str, mark: int, number: int, keys: list[str]
 ) -> None:
-    s = registry.get(study)
+    s = studies.get(study)
     policy = load(s, name, mark).policy
     rows = s.judge(s.config_of(name), policy, 5, Test("nominal", number))["tests"]
     data = results.at(results.tidy(study), mark)
@@ -78,7 +78,7 @@ def test_the_present_code_gives_the_shipped_figures(
 
 
 def test_the_last_policies_of_the_maze_do_what_the_table_says() -> None:
-    s = registry.get("peg_maze")
+    s = studies.get("peg_maze")
     rows = s.judge(s.config_of("ctd3"), load(s, "ctd3").policy, 5, Test("nominal", 2))["tests"]
     kept = results.at(results.tidy("peg_maze")).set_index("method").loc["ctd3"]
     found = pd.DataFrame(rows)

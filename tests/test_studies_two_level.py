@@ -1,4 +1,4 @@
-"""Studies of a planner over a low level: every method trains, is resumed, loaded and tested."""
+"""Studies of a planner over a low level: methods train, are resumed, loaded and tested; figures."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ import numpy as np
 import pytest
 from small_studies import small
 
-from cmc import store
+from cmc import store, studies
 from cmc.__main__ import main
 from cmc.envs.peg_push import BOX_TOP, PUSH, PegPush
+from cmc.learning.low_level import LowLevel
 from cmc.robot import panda
-from cmc.studies import peg_maze, peg_push, recorded, registry
+from cmc.studies import peg_maze, peg_push, recorded, two_level_tests
 from cmc.studies.evaluation import evaluate
 from cmc.studies.peg_push import TIME_CONSTANT, scaled
 from cmc.studies.runner import load, marks_of, train
 from cmc.studies.study import Test
 from cmc.studies.two_level import TwoLevelConfig
-from cmc.studies.two_level_tests import Episodes, figures, judge, motion, slope_at_rest
+from cmc.studies.two_level_tests import consistency, figures, judge, motion, slope_at_rest
 
 MAZE, PUSHING = small(peg_maze.STUDY), small(peg_push.STUDY)
 EVERY = [(MAZE, name) for name in MAZE.methods]
@@ -33,12 +34,8 @@ LEARNS = ("ctd3", "td3", "hiro")
 ADAPTED = ("ctd3_short", "ctd3_plain_view", "ctd3_no_bursts", "ctd3_no_pull", "ctd3_tuned")
 
 
-def weights(path: Path) -> dict[str, np.ndarray]:
-    return store.load_checkpoint(path)[0]
-
-
 def same_weights(one: Path, other: Path) -> None:
-    expected, found = weights(other), weights(one)
+    found, expected = (store.load_checkpoint(path)[0] for path in (one, other))
     assert expected.keys() == found.keys()
     for key, value in found.items():
         np.testing.assert_array_equal(value, expected[key], err_msg=key)
@@ -47,7 +44,7 @@ def same_weights(one: Path, other: Path) -> None:
 @pytest.mark.parametrize(("study", "name"), EVERY + SOME, ids=lambda x: getattr(x, "name", x))
 def test_every_method_trains_loads_and_is_tested(study, name: str, tmp_path: Path) -> None:
     path = train(study, name, [0, 3], length=240, out=tmp_path)
-    trained = weights(path)
+    trained = store.load_checkpoint(path)[0]
     assert marks_of(trained) == [120, 240]
     moved = [
         not np.array_equal(trained[key], trained[key.replace("00000240", "00000120")])
@@ -130,9 +127,9 @@ def test_methods_change_what_their_title_says() -> None:
     hiro = peg_maze.STUDY.config_of("hiro_matched")
     assert (hiro.task.command, hiro.hierarchy.high_noise, hiro.joint_noise) == ("joint", 0.3, 0.1)
     assert hiro.hierarchy.high_noise_end is None
-    sizes = registry.get("peg_maze_paper_sizes").config
+    sizes = studies.get("peg_maze_paper_sizes").config
     assert (sizes.planner_hidden, sizes.low_hidden) == ((400, 300), (200, 200))
-    assert registry.get("peg_maze_stiff").config.task.peg.stiffness == 0.0
+    assert studies.get("peg_maze_stiff").config.task.peg.stiffness == 0.0
 
 
 # -- contact of changed stiffness --------------------------------------------------------------
@@ -140,7 +137,18 @@ def test_methods_change_what_their_title_says() -> None:
 
 @pytest.mark.parametrize("scale", [0.4, 1.0, 4.0])
 def test_only_the_time_constant_of_what_touches_changes(scale: float) -> None:
-    nominal, changed = (kind(PUSH, 1).worlds.model for kind in (PegPush, scaled(scale)))
+    tasks = [kind(PUSH, 1) for kind in (PegPush, scaled(scale))]
+    # what the engine uses when the peg is 0.05 mm inside the box's top
+    stiffness = []
+    for model in (task.worlds.model for task in tasks):
+        data, tip = mujoco.MjData(model), BOX_TOP + [0.012, 0.0135, -5e-5]
+        data.qpos[:7] = panda.inverse_kinematics(tip, tool=panda.FINGERTIP + PUSH.peg.length)
+        mujoco.mj_forward(model, data)
+        touching = data.efc_type == mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL
+        assert touching.any()
+        stiffness.append(data.efc_KBIP[touching][0, :2])
+    np.testing.assert_allclose(stiffness[1] / stiffness[0], [scale**-2, 1 / scale], rtol=1e-9)
+    nominal, changed = (task.worlds.model for task in tasks)
     for name in ("peg", "lid", "obstacle", "base", "side_left", "stop"):
         np.testing.assert_array_equal(nominal.geom(name).solref, [TIME_CONSTANT, 1.0])
         np.testing.assert_allclose(changed.geom(name).solref, [scale * TIME_CONSTANT, 1.0])
@@ -149,23 +157,6 @@ def test_only_the_time_constant_of_what_touches_changes(scale: float) -> None:
     for model, buffer in zip((nominal, changed), buffers, strict=True):
         mujoco.mj_saveModel(model, None, buffer)
     np.testing.assert_array_equal(*buffers)
-
-
-def _engine_constants(task: PegPush) -> np.ndarray:
-    """Stiffness and damping that MuJoCo uses when the peg is 0.05 mm inside the box's top."""
-    model = task.worlds.model
-    data, tip = mujoco.MjData(model), BOX_TOP + [0.012, 0.0135, -5e-5]
-    data.qpos[:7] = panda.inverse_kinematics(tip, tool=panda.FINGERTIP + PUSH.peg.length)
-    mujoco.mj_forward(model, data)
-    touching = data.efc_type == mujoco.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL
-    assert touching.any()
-    return data.efc_KBIP[touching][0, :2]
-
-
-@pytest.mark.parametrize("scale", [0.4, 2.0])
-def test_the_engine_uses_the_stiffness_and_damping_that_are_stated(scale: float) -> None:
-    nominal, changed = (_engine_constants(kind(PUSH, 1)) for kind in (PegPush, scaled(scale)))
-    np.testing.assert_allclose(changed / nominal, [scale**-2, 1 / scale], rtol=1e-9)
 
 
 @pytest.mark.parametrize("scale", [0.39, 0.0, -1.0, np.nan])
@@ -178,15 +169,22 @@ def test_a_time_constant_that_the_engine_would_raise_is_refused(scale: float) ->
 
 
 def test_an_episode_that_touches_and_leaves_has_passed_by() -> None:
-    success = np.array([[True, False, False, False]])
-    touched = np.array([[True, True, True, False]])
-    distance = np.array([[0.0001, 0.0104, 0.0312344, 0.02]])
-    nearest = np.minimum(distance, [[1.0, 0.0002, 0.0003, 0.015]])
-    force = np.array([[[0.0, 0.5, 3.0, 7.0]]])
-    found = Episodes(success, touched, distance, nearest, distance, force, 2 * force, distance)
+    """Two ticks of four episodes of one seed."""
+    last = np.array([0.0001, 0.0104, 0.0312344, 0.02])
+    force = np.array([[0.0, 0.5, 3.0, 7.0]] * 2)
+    found = {
+        "success": np.array([[[False, True, True, True]], [[True, False, False, False]]]),
+        "distance": np.array([[[1.0, 0.0002, 0.0003, 0.015]], [last]]),
+        "reward": np.array([[[-1.0, -2.0, -3.0, -4.0]]] * 2),
+        "penetration": np.array([[[0.0, 1e-4, 2e-4, 5e-4]], [[0.0, 0.0, 0.0, 4e-4]]]),
+        "contact_force": force[:, None],
+        "contact_force_max": 2 * force[:, None],
+    }
     (row,) = figures(found)
-    assert row["passed_by"] == 0.5
+    assert row["passed_by"] == 0.75
+    assert (row["success"], row["touched"], row["return"]) == (0.25, 1.0, -5.0)
     assert (row["final_mm"], row["nearest_mm"]) == pytest.approx((15.2, 0.25))
+    assert (row["deepest_mm"], row["median_deepest_mm"]) == pytest.approx((0.5, 0.15))
     assert (row["no_contact"], row["below_1_N"], row["below_5_N"]) == (0.25, 0.25, 0.5)
     assert (row["below_1_N_50hz"], row["largest_N_50hz"], row["largest_N"]) == (0.5, 7.0, 14.0)
 
@@ -203,31 +201,67 @@ def test_slopes_are_zero_without_a_low_level_and_refused_in_joint_space() -> Non
         slope_at_rest(MAZE.config_of("hiro"), gain, 1)
 
 
+# -- how consistent a low level is, over starts and pushes -----------------------------------------
+
+
+class Linear(LowLevel):
+    """u = clip(gain y): one gain for each seed."""
+
+    def __init__(self, *gains: float) -> None:
+        super().__init__(None)
+        self.gains = np.array(gains)[:, None, None]
+
+    def act(self, observation, explore):
+        return np.clip(self.gains * observation[..., :6], -1.0, 1.0)
+
+
+@pytest.mark.parametrize("study", [peg_push.STUDY, peg_maze.STUDY], ids=lambda s: s.name)
+def test_a_higher_gain_resists_pushes_and_starts(study) -> None:
+    found = consistency(study.config, Linear(0.0, 20.0, 0.0), seeds=3, starts=8)
+    for values in found.values():
+        np.testing.assert_allclose(values[0], values[2], rtol=1e-9)  # the same worlds
+    assert found["moved_mm"][1] > found["moved_mm"][0]
+    assert found["push_mm"][1] < found["push_mm"][0]
+    np.testing.assert_allclose(-found["moved_x_mm"], found["moved_mm"])
+
+
+def test_a_step_is_five_millimeters_wherever_it_starts() -> None:
+    """Near the edge of the maze's box a clamped step would be shorter; here the spread is small."""
+    found = consistency(peg_maze.STUDY.config, Linear(50.0), seeds=1, starts=16)
+    assert found["moved_mm"][0] > 0.003
+    assert found["starts_mm"][0] < 0.001
+
+
+def test_the_spread_without_action_is_what_the_push_does_to_the_gains_alone(monkeypatch) -> None:
+    """Without action the loop is nearly linear, so that the effect scales with the force."""
+    spreads = []
+    for force in (0.0, 0.2, 0.4):
+        monkeypatch.setattr(two_level_tests, "PUSH", force)
+        spreads.append(consistency(peg_push.STUDY.config, Linear(0.0), 1, 4)["push_mm"][0])
+    assert spreads[0] < 1e-12
+    assert spreads[2] / spreads[1] == pytest.approx(2.0, rel=0.02)
+
+
 # -- recordings --------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short training, and a recorded episode of it."""
     folder = tmp_path_factory.mktemp("runs")
-    request = ["train", "peg_push", "--method", "frozen", "--seeds", "2", "--out", str(folder)]
-    assert main([*request, "--steps", "160"]) == 0
+    both = ["peg_push", "--method", "frozen"]
+    assert main(["train", *both, "--seeds", "2", "--out", str(folder), "--steps", "160"]) == 0
+    checkpoint, out = folder / "peg_push_frozen.safetensors", folder / "episode.npz"
+    request = ["play", *both, "--seed", "1", "--episode", "3", "--checkpoint", str(checkpoint)]
+    assert main([*request, "--out", str(out)]) == 0
     return folder
 
 
-@pytest.fixture(scope="module")
-def episode(run: Path) -> Path:
-    path = run / "episode.npz"
-    request = ["play", "peg_push", "--method", "frozen", "--seed", "1", "--episode", "3"]
-    checkpoint = str(run / "peg_push_frozen.safetensors")
-    assert main([*request, "--checkpoint", checkpoint, "--out", str(path)]) == 0
-    return path
-
-
-def test_a_recording_is_the_motion_it_was_made_of(run: Path, episode: Path) -> None:
+def test_a_recording_is_the_motion_it_was_made_of(run: Path) -> None:
     path = run / "peg_push_frozen.safetensors"
     policy = load(peg_push.STUDY, "frozen", seed=1, path=path).policy
     wanted = motion(peg_push.STUDY.config_of("frozen"), policy, 3)
-    found = recorded.load(episode)
+    found = recorded.load(run / "episode.npz")
     for name in ("t", "qpos", "tip", "force", "distance"):
         np.testing.assert_array_equal(found[name], wanted[name])
     for name, value in wanted["markers"].items():
@@ -243,8 +277,8 @@ def test_a_recording_is_the_motion_it_was_made_of(run: Path, episode: Path) -> N
 
 
 @pytest.mark.parametrize("kind", ["truncated", "foreign", "text", "scene"])
-def test_bad_recordings_are_refused(kind: str, episode: Path, tmp_path: Path) -> None:
-    path = tmp_path / "bad.npz"
+def test_bad_recordings_are_refused(kind: str, run: Path, tmp_path: Path) -> None:
+    path, episode = tmp_path / "bad.npz", run / "episode.npz"
     if kind == "truncated":
         path.write_bytes(episode.read_bytes()[:-200])
     elif kind == "foreign":

@@ -1,30 +1,20 @@
 """Gymnasium environments; importing this package registers them."""
 
+from typing import Any
+
 from gymnasium.envs.registration import register
 
-register(
-    id="cmc/PegTouch-v0",
-    entry_point="cmc.envs.peg_touch:PegTouchEnv",
-    vector_entry_point="cmc.envs.peg_touch:PegTouchVectorEnv",
-)
-register(
-    id="cmc/PegMaze-v0",
-    entry_point="cmc.envs.peg_maze:PegMazeEnv",
-    vector_entry_point="cmc.envs.peg_maze:PegMazeVectorEnv",
-)
-register(
-    id="cmc/PegMazeJoint-v0",
-    entry_point="cmc.envs.peg_maze:PegMazeEnv",
-    vector_entry_point="cmc.envs.peg_maze:PegMazeVectorEnv",
-    kwargs={"regime": "joint"},
-)
-register(
-    id="cmc/PegPush-v0",
-    entry_point="cmc.envs.peg_push:PegPushEnv",
-    vector_entry_point="cmc.envs.peg_push:PegPushVectorEnv",
-)
-register(
-    id="cmc/Plant-v0",
-    entry_point="cmc.envs.plant_env:PlantEnv",
-    vector_entry_point="cmc.envs.plant_env:PlantVectorEnv",
-)
+_ENVIRONMENTS: dict[str, tuple[str, dict[str, Any]]] = {
+    "PegTouch": ("peg_touch:PegTouch", {}),
+    "PegMaze": ("peg_maze:PegMaze", {}),
+    "PegMazeJoint": ("peg_maze:PegMaze", {"regime": "joint"}),
+    "PegPush": ("peg_push:PegPush", {}),
+    "Plant": ("plant_env:Plant", {}),
+}
+for _name, (_place, _options) in _ENVIRONMENTS.items():
+    register(
+        id=f"cmc/{_name}-v0",
+        entry_point=f"cmc.envs.{_place}Env",
+        vector_entry_point=f"cmc.envs.{_place}VectorEnv",
+        kwargs=_options,
+    )

@@ -13,26 +13,27 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cmc.envs.plant_env import PlantVectorEnv
-from cmc.envs.vector import Array32, Step
+from cmc.envs.vector import Array, Array32, Mask, Step
+from cmc.theory.arrays import checked, number
 from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.tracking import Tracker
 
-Array = NDArray[np.float64]
 Error = Callable[[Array], Array]
 Model = Callable[[Array], tuple[Array, Array]]
 Transforms = AuxiliarySpace | Callable[[Array], AuxiliarySpace]
 
 
-class AuxiliarySpaceWrapper(gym.Wrapper[NDArray[np.float32], Any, Any, Any]):
+class AuxiliarySpaceWrapper(gym.Wrapper[Array32, Any, Any, Any]):
     """Observe (z_i, integral of z_i) and command u = u0 + T_a a, with z = T_y (y - y_d).
 
     With `model`, a policy that decreases in all of its inputs, one network per dimension, meets the
     paper's sign condition on any plant: R_ii is positive (`constraint_sign`). Order, sign and scale
     of the eigenvectors are followed from step to step, so that the integral keeps its meaning.
-    With `transforms` of your own, R is theirs: tell it the policy.
+    With `transforms` of your own, R is theirs: tell it the policy. `space` holds T_y, T_a, Lambda
+    and R at the present observation.
 
     Args:
         env: an environment with Box observations and n commands.
@@ -44,7 +45,6 @@ class AuxiliarySpaceWrapper(gym.Wrapper[NDArray[np.float32], Any, Any, Any]):
         integral: whether the integral is observed; without it the observation is z (n,).
         u0: command to which T_a a is added, broadcast to (n,).
         limit: bound of the declared action space; the command is clipped to the env's own.
-        bound: bound of the declared observation space; larger values are clipped to it.
 
     Raises:
         TypeError: if the action space is no Box, or not one of model and transforms is given.
@@ -63,56 +63,45 @@ class AuxiliarySpaceWrapper(gym.Wrapper[NDArray[np.float32], Any, Any, Any]):
         integral: bool = True,
         u0: ArrayLike = 0.0,
         limit: float = 1.0,
-        bound: float = 1e6,
     ) -> None:
         super().__init__(env)
         if not isinstance(env.action_space, spaces.Box):
             raise TypeError(f"wanted a Box of commands, got {env.action_space}")
-        if len(env.action_space.shape) != 1 or not (np.isfinite(h) and h > 0):
-            raise ValueError(f"wanted flat commands and h > 0, got {env.action_space} and h = {h}")
+        if len(env.action_space.shape) != 1:
+            raise ValueError(f"wanted flat commands, got {env.action_space}")
         if (model is None) == (transforms is None):
             raise TypeError("wanted either a model or transforms")
-        self.n, self.h = env.action_space.shape[0], float(h)
+        self.n, self.h = env.action_space.shape[0], number("h", h, above=0.0)
         self.error, self.model, self.transforms = error, model, transforms
-        self._columns = slice(None, None, 1 if integral else 2)
-        size = 2 * self.n if integral else self.n
+        self._inner, self._columns = env.action_space, slice(None, None, 1 if integral else 2)
         self.u0 = np.broadcast_to(np.asarray(u0, dtype=float), (self.n,)).copy()
         self.action_space = spaces.Box(-limit, limit, (self.n,), np.float32)
-        self.observation_space = spaces.Box(-bound, bound, (size,), np.float32)
-        self.integral: Array = np.zeros(self.n)
-        self._tracker = Tracker()
+        size = 2 * self.n if integral else self.n
+        self.observation_space = self._seen = spaces.Box(-1e6, 1e6, (size,), np.float32)
+        self.integral, self._tracker = np.zeros(self.n), Tracker()
         self.space: AuxiliarySpace | None = None
-        """T_y, T_a, Lambda and R at the present observation."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    ) -> tuple[Array32, dict[str, Any]]:
         """Start an episode; the integral starts with the first error."""
         obs, info = self.env.reset(seed=seed, options=options)
         self._tracker.reset()
         self.integral = np.zeros(self.n)
         return self._observe(obs), info
 
-    def step(
-        self, action: ArrayLike
-    ) -> tuple[NDArray[np.float32], Any, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Array32, Any, bool, bool, dict[str, Any]]:
         """Command u = u0 + T_a a."""
         if self.space is None:
             raise gym.error.ResetNeeded("call reset before step")
-        a = np.asarray(action, dtype=float)
-        if a.shape != (self.n,) or not np.isfinite(a).all():
-            raise ValueError(f"action: wanted {self.n} finite numbers, got {a}")
-        inner = self.env.action_space
-        assert isinstance(inner, spaces.Box)
+        a, inner = checked("action", action, "n", n=self.n), self._inner
         command = np.clip(self.u0 + self.space.T_a @ a, inner.low, inner.high)
         obs, reward, terminated, truncated, info = self.env.step(command.astype(inner.dtype))
         return self._observe(obs), reward, terminated, truncated, info
 
-    def _observe(self, obs: Any) -> NDArray[np.float32]:
+    def _observe(self, obs: Any) -> Array32:
         seen = np.asarray(obs, dtype=float)
-        e = np.asarray(self.error(seen), dtype=float)
-        if e.shape != (self.n,) or not np.isfinite(e).all():
-            raise ValueError(f"error: wanted {self.n} finite numbers, got {e}")
+        e = checked("error", self.error(seen), "n", n=self.n)
         if self.model is not None:
             self.space = self._tracker.update(*self.model(seen))
         else:
@@ -123,9 +112,7 @@ class AuxiliarySpaceWrapper(gym.Wrapper[NDArray[np.float32], Any, Any, Any]):
         z = self.space.T_y @ e
         self.integral = self.integral + self.h * z  # the new value included, as everywhere
         s = np.stack([z, self.integral], axis=-1).ravel()[self._columns]
-        box = self.observation_space
-        assert isinstance(box, spaces.Box)
-        return np.clip(s, box.low, box.high).astype(np.float32)
+        return np.clip(s, self._seen.low, self._seen.high).astype(np.float32)
 
 
 class AuxiliarySpaceVectorWrapper(gym.vector.VectorWrapper[Array32, ArrayLike, Array]):
@@ -134,10 +121,8 @@ class AuxiliarySpaceVectorWrapper(gym.vector.VectorWrapper[Array32, ArrayLike, A
     z = T_y (y - target) and u = u0 + T_a a, clipped to the plant's limits, as in
     `cmc.theory.simulate.closed_loop` with the same transforms: what was trained can be certified.
 
-    Args:
-        env: the plants; its `target` is y_d and its `h` the sample time.
-        transforms: kept at every state, such as `transforms_that_fit` offers.
-        u0: command to which T_a a is added, (n,); the one that holds the target by default.
+    The transforms are the same at every state, such as `transforms_that_fit` offers; y_d and the
+    sample time are the plants' `target` and `h`; u0, (n,), holds the target by default.
 
     Raises:
         TypeError: if the transforms move with the state.
@@ -168,18 +153,17 @@ class AuxiliarySpaceVectorWrapper(gym.vector.VectorWrapper[Array32, ArrayLike, A
 
     def step(self, actions: ArrayLike) -> Step:
         """Command u = u0 + T_a a."""
-        u = self.u0 + np.asarray(actions, dtype=float) @ self.space.T_a.T
+        a = checked("actions", actions, "N n", N=self.num_envs, n=len(self.u0))
+        u = self.u0 + a @ self.space.T_a.T
         obs, reward, ended, cut, info = self.env.step(u)
-        done, every = ended | cut, np.ones(self.num_envs, dtype=bool)
-        final = info.get("final_obs", obs)
-        seen = self._seen(final, every)
+        seen = self._seen(info.get("final_obs", obs), np.ones(self.num_envs, dtype=bool))
         if "final_obs" in info:  # the trajectories that ended have started anew
-            info = {**info, "final_obs": seen}
+            info, done = {**info, "final_obs": seen}, ended | cut
             self.integral = np.where(done[:, None], 0.0, self.integral)
             seen = np.where(done[:, None], self._seen(obs, done), seen)
         return seen, reward, ended, cut, info
 
-    def _seen(self, obs: Any, add: NDArray[np.bool_]) -> Array32:
+    def _seen(self, obs: Any, add: Mask) -> Array32:
         z = (np.asarray(obs, dtype=float) - self.plants.target) @ self.space.T_y.T
         self.integral = self.integral + self.plants.h * z * add[:, None]
         s = np.stack([z, self.integral], axis=-1)

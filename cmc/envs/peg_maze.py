@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from cmc.envs.panda_config import PandaTaskConfig
 from cmc.envs.panda_gym import PandaEnv, PandaVectorEnv
-from cmc.envs.panda_task import Array, PandaTask
+from cmc.envs.panda_task import PandaTask
+from cmc.envs.vector import Array
+from cmc.envs.worlds import PandaTaskConfig
 from cmc.robot.osc import MAZE_GAINS, ControlLaw
 from cmc.robot.panda import Peg
 
 GOAL_LOW = np.array([0.410, -0.025, 0.005])
 GOAL_HIGH = np.array([0.415, -0.020, 0.015])
-SUCCESS_DISTANCE = 0.005
-"""Appendix G: success is an L2 distance below 5 mm."""
 
 STIFF = PandaTaskConfig(
     scene="peg_maze.xml",
@@ -56,115 +55,59 @@ REGIMES = {"stiff": STIFF, "soft": SOFT, "joint": JOINT}
 class PegMaze(PandaTask):
     """N peg mazes; see `PegMazeEnv` for what they observe and are rewarded for."""
 
-    near = SUCCESS_DISTANCE
+    near = 0.005  # m, appendix G
 
     def _draw_goal(self, rng: np.random.Generator) -> Array:
         return rng.uniform(GOAL_LOW, GOAL_HIGH)
 
     def _reward(self, distance: Array, tilt: Array) -> tuple[Array, dict[str, Array]]:
-        return -distance, {"distance": -distance}
+        reward = -distance
+        return reward, {"distance": reward}
+
+
+class PegMazeVectorEnv(PandaVectorEnv):
+    """`num_envs` peg mazes stepped in one call; see `PegMazeEnv` and `PandaVectorEnv`."""
+
+    def __init__(
+        self, num_envs: int = 1, regime: str = "stiff", *, changes: Any = None, **interface: Any
+    ) -> None:
+        if regime not in REGIMES:
+            raise ValueError(f"regime must be one of {sorted(REGIMES)}, got {regime!r}")
+        config = replace(REGIMES[regime], **(changes or {}))
+        super().__init__(PegMaze(config, num_envs), **interface)
 
 
 class PegMazeEnv(PandaEnv):
     """Move a peg among walls and posts to a goal 18 mm away; the straight path is blocked.
 
-    A Panda under task-space control carries a 50 mm peg. Every tick (20 ms) a low-level action
-    adds an acceleration to the control law,
+    A Panda under task-space control carries a 50 mm peg. Every tick (20 ms) a low-level action u
+    adds an acceleration to the control law, x'' = K_p e + K_d e' + u with e = sub-goal - tip; every
+    20 ticks a high-level action sets the sub-goal, straight down. Actions are clipped to their
+    bounds; NaN, infinity and wrong shapes raise ValueError.
 
-        x'' = K_p e + K_d e' + u,    e = sub-goal - tip,
+    - Action (9,): u, 0-2 in m/s^2 (soft: in 0.2 m/s^2) and 3-5 in rad/s^2, within +-1; absolute
+      sub-goal of the tip 6-8, m, from (.40, -.03, -.005) to (.43, -.015, .015).
+    - Observation (34,), slices in `env.task.layout`: position of the (true) tip 0-2, m; rotation
+      3-5, a rotation vector from pointing straight down, rad; velocity 6-11, m/s and rad/s; goal
+      12-14, m; error e of the hand's nominal tip 15-20, m and rad, limited in the soft regime;
+      latent y = K1 e + K2 e' 21-26, m/s^2 and rad/s^2; integral of y since the sub-goal was set
+      27-32 (0 for rotation); time_to_go until the next sub-goal is due 33, s, < 0 when overdue.
+    - Reward: `info["reward_terms"]`, distance = -|goal - tip|, m. The low level's own,
+      `info["tracking_terms"]`: translation = -|sub-goal - tip|, m, and rotation, rad.
+    - Info: `contact_force` at the end of the tick, `contact_force_max` over its physics steps, N;
+      `penetration`, the deepest of the tick, m; `success`: a distance below 5 mm.
+    - Start: tip at (.429, -.019, .008) m with up to 1 mrad of error in every joint, at rest; goal
+      uniform from (.410, -.025, .005) to (.415, -.020, .015) m.
+    - End: never terminated; truncated after 400 ticks (8 s).
 
-    and every 20 ticks a high-level action sets the sub-goal.
+    Regime "joint": u is 7 joint torques (in 0.3 N m), applied as |u| towards the sub-goal, which is
+    7 joint increments from the current pose (at most 0.1 rad), clamped to the joint limits; torque
+    = 1 N m/rad (q_d - q) + u + gravity and Coriolis terms. Joints, joint_velocity and joint_error
+    (7 each, rad, rad/s) are observed in place of error, latent and integral.
 
-    ## Action space
-
-    | Num | Action (action_mode "two_level")    | Min               | Max              | Unit    |
-    |-----|-------------------------------------|-------------------|------------------|---------|
-    | 0-2 | u, translation                      | -1                | 1                | 1 m/s^2 (soft: 0.2) |
-    | 3-5 | u, rotation                         | -1                | 1                | rad/s^2 |
-    | 6-8 | sub-goal: absolute tip position     | .40, -.03, -.005  | .43, -.015, .015 | m       |
-
-    `action_mode="low"` takes entries 0-5 and gets sub-goals by `set_subgoal`; "high" takes entries
-    6-8 and lasts 20 ticks. Actions outside the bounds are clipped; NaN, infinity and wrong shapes
-    raise ValueError. The sub-goal's orientation is straight down.
-
-    Regime "joint": u is 7 joint torques (in units of 0.3 N m), applied as |u| towards the sub-goal, and
-    the sub-goal is 7 joint increments from the current pose (at most 0.1 rad), clamped to the
-    joint limits; torque = 1 N m/rad (q_d - q) + u + gravity and Coriolis terms.
-
-    ## Observation space
-
-    | Num   | Field       | Observation                                                 | Unit       |
-    |-------|-------------|-------------------------------------------------------------|------------|
-    | 0-2   | position    | tip (the true one, also on a compliant mount)               | m          |
-    | 3-5   | rotation    | rotation vector from pointing straight down                 | rad        |
-    | 6-11  | velocity    | of the tip, linear and angular                              | m/s, rad/s |
-    | 12-14 | goal        | position                                                    | m          |
-    | 15-20 | error       | e, of the hand's nominal tip, limited in the soft regime    | m, rad     |
-    | 21-26 | latent      | y = K1 e + K2 e'                                            | m/s^2, ... |
-    | 27-32 | integral    | of y since the sub-goal was set; 0 for rotation             | m/s, ...   |
-    | 33    | time_to_go  | until the next sub-goal is due; negative when overdue       | s          |
-
-    `env.task.layout` holds the slices, `HIGH_LEVEL`, `ACTOR` and `CRITIC` name what each level
-    reads. Regime "joint" has joints (7, rad), joint_velocity (7, rad/s) and joint_error (7, rad)
-    in place of error, latent and integral.
-
-    ## Rewards
-
-    `info["reward_terms"]`: distance = -|goal - tip|, m. `info["tracking_terms"]`, the low level's
-    reward: translation = -|sub-goal - tip| in m and rotation in rad.
-
-    `info` also holds `contact_force` at the end of the tick and `contact_force_max` over its
-    physics steps (N), `penetration` (m, deepest of the tick) and `success` (distance < 5 mm).
-
-    ## Starting state
-
-    Tip at (.429, -.019, .008) m with up to 1 mrad of error in every joint, at rest; goal uniform in
-    (.410-.415, -.025 - -.020, .005-.015) m.
-
-    ## Episode end
-
-    Never terminated; truncated after 400 ticks (8 s).
-
-    ## Arguments
-
-    | Parameter     | Type     | Default     | Description                                        |
-    |---------------|----------|-------------|----------------------------------------------------|
-    | `regime`      | str      | "stiff"     | "stiff", "soft" or "joint" (see `REGIMES`)         |
-    | `action_mode` | str      | "two_level" | "two_level", "low" or "high"                       |
-    | `low_level`   | callable | None        | u(y, integral of y) inside a "high" step           |
-    | `changes`     | dict     | {}          | fields of `PandaTaskConfig` to replace, `hold=False` for control at every physics step |
-
-    ## Version history
-
-    * v0: first version.
-    """  # noqa: E501
-
-    def __init__(self, regime: str = "stiff", *, changes: Any = None, **interface: Any) -> None:
-        super().__init__(PegMaze(regime_config(regime, changes)), **interface)
-
-
-class PegMazeVectorEnv(PandaVectorEnv):
-    """`num_envs` peg mazes stepped in one call; see `PegMazeEnv`.
-
-    Args:
-        num_envs: number of worlds.
-        regime: as `PegMazeEnv`.
-        changes: as `PegMazeEnv`.
-        interface: action_mode, low_level and autoreset_mode.
+    Keywords: `regime` (of `REGIMES`), `changes` of fields of `PandaTaskConfig`, such as
+    `{"hold": False}` for control at every physics step, `render_mode` (None or "rgb_array"), and
+    `action_mode` and `low_level` (see `PandaVectorEnv`).
     """
 
-    def __init__(
-        self, num_envs: int = 1, regime: str = "stiff", *, changes: Any = None, **interface: Any
-    ) -> None:
-        super().__init__(PegMaze(regime_config(regime, changes), num_envs), **interface)
-
-
-def regime_config(regime: str, changes: dict[str, Any] | None = None) -> PandaTaskConfig:
-    """Configuration of a named regime, with some fields replaced.
-
-    Raises:
-        ValueError: if there is no such regime.
-    """
-    if regime not in REGIMES:
-        raise ValueError(f"regime must be one of {sorted(REGIMES)}, got {regime!r}")
-    return replace(REGIMES[regime], **(changes or {}))
+    many = PegMazeVectorEnv

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from cmc.envs.panda_config import PandaTaskConfig
 from cmc.envs.panda_gym import PandaEnv, PandaVectorEnv
-from cmc.envs.panda_task import Array, PandaTask
+from cmc.envs.panda_task import PandaTask
+from cmc.envs.vector import Array
+from cmc.envs.worlds import PandaTaskConfig
 from cmc.robot.osc import PUSH_GAINS, ControlLaw
 from cmc.robot.panda import Peg
 
@@ -49,90 +50,45 @@ class PegPush(PandaTask):
         return near + upright, {"translation": near, "rotation": upright}
 
 
+class PegPushVectorEnv(PandaVectorEnv):
+    """`num_envs` peg-push tasks stepped in one call; see `PegPushEnv` and `PandaVectorEnv`."""
+
+    def __init__(self, num_envs: int = 1, *, changes: Any = None, **interface: Any) -> None:
+        super().__init__(PegPush(replace(PUSH, **(changes or {})), num_envs), **interface)
+
+
 class PegPushEnv(PandaEnv):
     """Push a sliding lid open, insert the peg into a slot, push an obstacle aside, touch a target.
 
     A Panda under task-space control carries a 20 mm peg over a 36 mm box (geometry: `tab:geometry`;
-    lid and obstacle weigh 0.5 kg each). Every tick (20 ms) a low-level action adds an acceleration
-    to the control law, x'' = K_p e + K_d e' + u, and every 20 ticks a high-level action moves the
-    sub-goal relative to the current tip pose.
+    lid and obstacle weigh 0.5 kg each). Every tick (20 ms) a low-level action u adds an
+    acceleration to the control law, x'' = K_p e + K_d e' + u with e = sub-goal - tip; every 20
+    ticks a high-level action moves the sub-goal relative to the current tip pose. Actions are
+    clipped to their bounds; NaN, infinity and wrong shapes raise ValueError. Sub-goals are clamped
+    to 18 mm around the box's centre, 13 mm below to 15 mm above its top, and to 0.5 rad from
+    pointing straight down.
 
-    ## Action space
+    - Action (12,): u, 0-2 in m/s^2 and 3-5 in rad/s^2, within +-1; increment of the tip's position
+      6-8, within +-0.005 m, and of its rotation vector 9-11, within +-0.5 rad.
+    - Observation (40,), slices in `env.task.layout`: position of the tip 0-2, m; rotation 3-5, a
+      rotation vector from pointing straight down, rad; velocity 6-11, m/s and rad/s; goal, the
+      target, 12-14, m; sliders, lid (y) and obstacle (x, y) from their start, 15-17, m, and
+      slider_velocity 18-20, m/s; error e 21-26, m and rad; latent y = K1 e + K2 e' 27-32, m/s^2 and
+      rad/s^2; integral of y since the sub-goal was set 33-38 (0 for rotation); time_to_go until the
+      next sub-goal is due 39, s, < 0 when overdue.
+    - Reward: the sum of `info["reward_terms"]`, translation = -tanh(50 |target - tip|) and
+      rotation = -0.1 |tilt|. The low level's own, `info["tracking_terms"]`: translation =
+      -|sub-goal - tip|, m, and rotation, rad.
+    - Info: `contact_force` at the end of the tick, `contact_force_max` over its physics steps, N;
+      `penetration`, the deepest of the tick, m; `success`: strict touch, the tip within 0.5 mm of
+      the target in x and y and 0.3 mm in z.
+    - Start: tip uniform in an 8 mm cube around (0, 11.5, 4.5) mm from the centre of the box's top,
+      at rest, pointing down; lid closed, obstacle on the target.
+    - End: never terminated; truncated after 1000 ticks (20 s).
 
-    | Num  | Action (action_mode "two_level")          | Min    | Max   | Unit    |
-    |------|-------------------------------------------|--------|-------|---------|
-    | 0-2  | u, translation                            | -1     | 1     | m/s^2   |
-    | 3-5  | u, rotation                               | -1     | 1     | rad/s^2 |
-    | 6-8  | sub-goal: increment of the tip position   | -0.005 | 0.005 | m       |
-    | 9-11 | sub-goal: increment of the rotation vector| -0.5   | 0.5   | rad     |
-
-    `action_mode="low"` takes entries 0-5 and gets sub-goals by `set_subgoal`; "high" takes entries
-    6-11 and lasts 20 ticks. Actions outside the bounds are clipped; NaN, infinity and wrong shapes
-    raise ValueError. Sub-goals are clamped to 18 mm around the box's centre, 13 mm below to 15 mm
-    above its top, and to 0.5 rad from pointing straight down.
-
-    ## Observation space
-
-    | Num   | Field           | Observation                                       | Unit       |
-    |-------|-----------------|---------------------------------------------------|------------|
-    | 0-2   | position        | tip                                               | m          |
-    | 3-5   | rotation        | rotation vector from pointing straight down       | rad        |
-    | 6-11  | velocity        | of the tip, linear and angular                    | m/s, rad/s |
-    | 12-14 | goal            | position of the target                            | m          |
-    | 15-17 | sliders         | lid (y), obstacle (x, y) from their start         | m          |
-    | 18-20 | slider_velocity | of the same                                       | m/s        |
-    | 21-26 | error           | e = sub-goal - tip                                | m, rad     |
-    | 27-32 | latent          | y = K1 e + K2 e'                                  | m/s^2, ... |
-    | 33-38 | integral        | of y since the sub-goal was set; 0 for rotation   | m/s, ...   |
-    | 39    | time_to_go      | until the next sub-goal is due; < 0 when overdue  | s          |
-
-    `env.task.layout` holds the slices; `HIGH_LEVEL`, `ACTOR` and `CRITIC` name what each level
-    reads (`env.task.high_level` adds the sliders).
-
-    ## Rewards
-
-    `info["reward_terms"]`: translation = -tanh(50 |target - tip|), rotation = -0.1 |tilt|.
-    `info["tracking_terms"]`, the low level's reward: translation = -|sub-goal - tip| in m and
-    rotation in rad.
-
-    `info` also holds `contact_force` at the end of the tick and `contact_force_max` over its
-    physics steps (N), `penetration` (m, deepest of the tick) and `success`: strict touch, the tip
-    within 0.5 mm of the target in x and y and 0.3 mm in z.
-
-    ## Starting state
-
-    Tip uniform in an 8 mm cube around (0, 11.5, 4.5) mm from the centre of the box's top, at rest,
-    pointing down; lid closed, obstacle on the target.
-
-    ## Episode end
-
-    Never terminated; truncated after 1000 ticks (20 s).
-
-    ## Arguments
-
-    | Parameter     | Type     | Default     | Description                                        |
-    |---------------|----------|-------------|----------------------------------------------------|
-    | `action_mode` | str      | "two_level" | "two_level", "low" or "high"                       |
-    | `low_level`   | callable | None        | u(y, integral of y) inside a "high" step           |
-    | `changes`     | dict     | {}          | fields of `PandaTaskConfig` to replace, `hold=False` for control at every physics step |
-
-    ## Version history
-
-    * v0: first version.
-    """  # noqa: E501
-
-    def __init__(self, *, changes: Any = None, **interface: Any) -> None:
-        super().__init__(PegPush(replace(PUSH, **(changes or {}))), **interface)
-
-
-class PegPushVectorEnv(PandaVectorEnv):
-    """`num_envs` peg-push tasks stepped in one call; see `PegPushEnv`.
-
-    Args:
-        num_envs: number of worlds.
-        changes: as `PegPushEnv`.
-        interface: action_mode, low_level and autoreset_mode.
+    Keywords: `changes` of fields of `PandaTaskConfig`, such as `{"hold": False}` for control at
+    every physics step, `render_mode` (None or "rgb_array"), and `action_mode` and `low_level` (see
+    `PandaVectorEnv`).
     """
 
-    def __init__(self, num_envs: int = 1, *, changes: Any = None, **interface: Any) -> None:
-        super().__init__(PegPush(replace(PUSH, **(changes or {})), num_envs), **interface)
+    many = PegPushVectorEnv

@@ -11,9 +11,9 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from cmc import plants
-from cmc.envs.checks import checked, whole
-from cmc.envs.vector import Array32, Mask, NativeVectorEnv, Seed, SingleEnv, Step, without_pictures
+from cmc.envs.vector import Array32, Mask, NativeVectorEnv, Seed, SingleEnv, Step
 from cmc.plants import Plant
+from cmc.theory.arrays import checked, count, number
 
 Array = NDArray[np.float64]
 Reward = Callable[[Array, Array], Array]
@@ -63,53 +63,49 @@ class PlantVectorEnv(NativeVectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
     ) -> None:
-        without_pictures(render_mode)
         self.plant = p = plants.get(plant) if isinstance(plant, str) else plant
-        self.h, room = float(checked(h, (), "h")), float(checked(room, (), "room"))
+        self.h, room = number("h", h), number("room", room)
         if self.h <= 0.0 or room < 1.0:
             raise ValueError(f"wanted h > 0 and room >= 1, got h = {h} and room = {room}")
-        self.horizon, self.substeps = whole("horizon", horizon), whole("substeps", substeps)
+        self.horizon, self.substeps = count("horizon", horizon), count("substeps", substeps)
         middle, self._half = (p.y_low + p.y_high) / 2, (p.y_high - p.y_low) / 2
-        self.target = checked(middle if target is None else target, (p.n,), "target")
+        self.target = checked("target", middle if target is None else target, "n", n=p.n)
         ends = (middle - room * self._half, middle + room * self._half)
         seen = spaces.Box(ends[0].astype(np.float32), ends[1].astype(np.float32))
         command = spaces.Box(p.u_low.astype(np.float32), p.u_high.astype(np.float32))
-        super().__init__(num_envs, seen, command, autoreset_mode)
+        super().__init__(num_envs, seen, command, autoreset_mode, render_mode)
         self._ends, self._reward = ends, reward or self._quadratic
         self.y, self.u = np.tile(middle, (num_envs, 1)), np.zeros((num_envs, p.n))
         self.steps, self._streams = np.zeros(num_envs, dtype=int), [np.random.default_rng()]
-        self._rate()
+        if (shape := np.shape(p.f(self.y, self.u))) != self.y.shape:
+            raise ValueError(f"f(y, u): wanted shape {self.y.shape}, got {shape}")
 
     def _quadratic(self, y: Array, u: Array) -> Array:
         return -np.mean(((y - self.target) / self._half) ** 2, axis=-1)
 
-    def _rate(self) -> Array:
-        rate = np.asarray(self.plant.f(self.y, self.u), dtype=float)
-        if rate.shape != self.y.shape:
-            raise ValueError(f"f(y, u): wanted shape {self.y.shape}, got {rate.shape}")
-        return rate
-
     def _seed(self, seed: Seed) -> None:
-        if isinstance(seed, Sequence) and self.num_envs % max(len(seed), 1) == 0 and len(seed):
-            self._streams = [np.random.default_rng(s) for s in seed]
-        elif isinstance(seed, Sequence):
+        seeds = [seed] if not isinstance(seed, Sequence) else seed
+        if not seeds or self.num_envs % len(seeds):
             raise ValueError(f"seed: wanted a number that divides {self.num_envs}, got {seed}")
-        elif seed is not None:
-            self._streams = [np.random.default_rng(seed)]
+        if seed is not None:
+            self._streams = [np.random.default_rng(s) for s in seeds]
 
     def _begin(self, mask: Mask, options: dict[str, Any]) -> Array32:
         p, each = self.plant, self.num_envs // len(self._streams)
         start = np.concatenate([s.uniform(p.y_low, p.y_high, (each, p.n)) for s in self._streams])
         if "y" in options:
-            given = np.broadcast_to(np.asarray(options["y"], dtype=float), start.shape)
-            start = checked(given, start.shape, "y")
+            given = np.asarray(options["y"])
+            wide = given if given.ndim == 2 else np.tile(given, (self.num_envs, 1))
+            start = checked("y", wide, "N n", N=self.num_envs, n=p.n)
         self.y = np.where(mask[:, None], start, self.y)
         self.u, self.steps = np.where(mask[:, None], 0.0, self.u), np.where(mask, 0, self.steps)
         return self.y.astype(np.float32)
 
     def _advance(self, actions: ArrayLike) -> Step:
         p, dt = self.plant, self.h / self.substeps
-        self.u = np.clip(checked(actions, self.y.shape, "actions"), p.u_low, p.u_high)
+        self.u = np.clip(
+            checked("actions", actions, "N n", N=self.num_envs, n=p.n), p.u_low, p.u_high
+        )
         for _ in range(self.substeps):
             k1 = np.asarray(p.f(self.y, self.u))
             k2 = np.asarray(p.f(self.y + dt / 2 * k1, self.u))
@@ -127,8 +123,10 @@ class PlantVectorEnv(NativeVectorEnv):
 class PlantEnv(SingleEnv):
     """One trajectory of a plant; everything else is documented at `PlantVectorEnv`."""
 
-    def __init__(
-        self, plant: Plant | str = "coupled_lags", h: float = 0.02, **options: Any
-    ) -> None:
-        super().__init__(PlantVectorEnv(1, plant, h, autoreset_mode="Disabled", **options))
-        self.plant = self.batch.plant
+    many = PlantVectorEnv
+
+    @property
+    def plant(self) -> Plant:
+        """The plant."""
+        plant: Plant = self.batch.plant
+        return plant

@@ -1,9 +1,9 @@
-"""Vector environments that step all their trajectories at once: what they share."""
+"""Vector environments that step all their trajectories at once, and one trajectory of them."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +11,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
+
+from cmc.theory.arrays import checked, count, number
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -29,22 +31,24 @@ class NativeVectorEnv(VectorEnv[Array32, ArrayLike, Any]):
     - NEXT_STEP: in the step after; its action is ignored, its reward and other numbers are 0;
     - DISABLED: when `reset(options={"reset_mask": ...})` says so.
 
-    Args:
-        num_envs: trajectories.
-        observation: space of one.
-        action: space of one.
-        autoreset_mode: see above.
-
     Raises:
-        ValueError: for another mode, fewer than one trajectory, or a mask of another shape.
+        ValueError: for another mode, any render mode, or a mask of another shape.
     """
 
     def __init__(
-        self, num_envs: int, observation: Any, action: Any, autoreset_mode: AutoresetMode | str
+        self,
+        num_envs: int,
+        observation: Any,
+        action: Any,
+        autoreset_mode: AutoresetMode | str,
+        render_mode: str | None = None,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs: wanted at least 1, got {num_envs}")
-        self.num_envs, self.mode = num_envs, _mode(autoreset_mode)
+        if render_mode is not None:
+            raise TypeError(
+                f"render_mode: wanted None, got {render_mode!r}: this environment draws no "
+                "pictures; cmc.view.playback.record makes a 3D page of a motion"
+            )
+        self.num_envs, self.mode = count("num_envs", num_envs), _mode(autoreset_mode)
         self.metadata = {"render_modes": [], "autoreset_mode": self.mode}
         self.single_observation_space: Any = observation
         self.single_action_space: Any = action
@@ -61,7 +65,7 @@ class NativeVectorEnv(VectorEnv[Array32, ArrayLike, Any]):
         """Start the masked trajectories; observations of all."""
 
     @abstractmethod
-    def _advance(self, actions: ArrayLike) -> tuple[Array32, Array, Mask, Mask, dict[str, Any]]:
+    def _advance(self, actions: ArrayLike) -> Step:
         """One step of all: observations, reward, terminated, truncated, info."""
 
     def _describe(self, info: dict[str, Any]) -> dict[str, Any]:
@@ -85,88 +89,76 @@ class NativeVectorEnv(VectorEnv[Array32, ArrayLike, Any]):
         obs, reward, terminated, truncated, info = self._advance(actions)
         if self.mode is AutoresetMode.NEXT_STEP and self._ended.any():
             fresh, reward = self._ended, np.where(self._ended, 0.0, reward)
-            obs, info = self._begin(fresh, {}), _without(info, fresh)
+            obs = self._begin(fresh, {})
+            info = _each(info, lambda value: np.where(fresh, np.zeros((), value.dtype), value))
             terminated, truncated = terminated & ~fresh, truncated & ~fresh
-        ended = terminated | truncated
-        self._ended = ended
-        present = self._describe(info)
+        self._ended = ended = terminated | truncated
+        info = info | self._describe(info)
         if self.mode is AutoresetMode.SAME_STEP and ended.any():
-            final: dict[str, Any] = {"final_obs": obs, "_final_obs": ended}
-            final |= {"final_info": present, "_final_info": ended}
+            final = {"final_obs": obs, "_final_obs": ended, "_final_info": ended}
             obs = self._begin(ended, {})
-            return obs, reward, terminated, truncated, info | final | self._describe({})
-        return obs, reward, terminated, truncated, info | present
+            info = info | final | {"final_info": info} | self._describe({})
+        return obs, reward, terminated, truncated, info
 
 
 class SingleEnv(gym.Env[Array32, Array32]):
-    """One trajectory of a native vector environment.
-
-    Args:
-        batch: the environment with one trajectory, without automatic resets.
-    """
+    """One trajectory: `batch` is the vector environment `many` of one that never resets itself."""
 
     metadata: dict[str, Any] = {"render_modes": []}
+    many: Any
 
-    def __init__(self, batch: Any) -> None:
-        self.batch = batch
-        self.action_space, self.observation_space = (
-            batch.single_action_space,
-            batch.single_observation_space,
-        )
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        self.batch = self.many(1, *arguments, autoreset_mode=AutoresetMode.DISABLED, **options)
+        self.action_space = self.batch.single_action_space
+        self.observation_space = self.batch.single_observation_space
+
+    def _stream(self, seed: int | None) -> int | None:
+        """Seed of the trajectory that begins."""
+        return int(self.np_random.integers(2**31))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array32, dict[str, Any]]:
         """Start a new trajectory; see the vector environment for `options`."""
         super().reset(seed=seed)
-        stream = int(self.np_random.integers(2**31))
-        obs, info = self.batch.reset(seed=stream, options=options)
-        return obs[0], _first(info)
+        obs, info = self.batch.reset(seed=self._stream(seed), options=options)
+        return obs[0], _each(info, _first)
 
     def step(self, action: ArrayLike) -> tuple[Array32, float, bool, bool, dict[str, Any]]:
-        """Hold one command for a control period."""
+        """One step; see the vector environment for the action."""
         obs, reward, ended, truncated, info = self.batch.step(np.asarray(action)[None])
-        return obs[0], float(reward[0]), bool(ended[0]), bool(truncated[0]), _first(info)
+        return obs[0], reward.item(), ended.item(), truncated.item(), _each(info, _first)
 
 
-def _first(info: dict[str, Any]) -> dict[str, Any]:
-    """What `info` says of the first trajectory."""
+def set_numbers(config: Any, shape: str, names: Sequence[str], above: float | None = None) -> None:
+    """Turn fields of a frozen dataclass into finite floats, or tuples of them (JSON has lists)."""
+    for name in names:
+        found = checked(name, getattr(config, name), shape, above=above).tolist()
+        object.__setattr__(config, name, tuple(found) if shape else found)
+
+
+def set_counts(config: Any, names: Sequence[str]) -> None:
+    """Turn fields of a frozen dataclass into whole numbers of at least 1."""
+    for name in names:
+        object.__setattr__(config, name, count(name, number(name, getattr(config, name))))
+
+
+def _each(info: dict[str, Any], change: Callable[[NDArray[Any]], Any]) -> dict[str, Any]:
+    """`info` with every array of it changed."""
     return {
-        name: _first(value)
-        if isinstance(value, dict)
-        else (value[0] if value.ndim > 1 else value[0].item())
+        name: _each(value, change) if isinstance(value, dict) else change(value)
         for name, value in info.items()
     }
+
+
+def _first(value: NDArray[Any]) -> Any:
+    return value[0] if value.ndim > 1 else value.item()
 
 
 def _mode(mode: AutoresetMode | str) -> AutoresetMode:
     names = {m.value.lower(): m for m in AutoresetMode}
-    key = getattr(mode, "value", mode)
-    plain = key.lower().replace("_", "") if isinstance(key, str) else None
-    if plain not in names:
+    found = names.get(str(getattr(mode, "value", mode)).lower().replace("_", ""))
+    if found is None:
         wanted = ", ".join(m.value for m in AutoresetMode)
         raise ValueError(f"autoreset_mode: wanted one of {wanted}, got {mode!r}")
-    return names[plain]
-
-
-def _without(info: dict[str, Any], fresh: Mask) -> dict[str, Any]:
-    """`info` with zeros for trajectories that have just begun."""
-    return {
-        name: _without(value, fresh)
-        if isinstance(value, dict)
-        else np.where(fresh, np.zeros((), value.dtype), value)
-        for name, value in info.items()
-    }
-
-
-def without_pictures(render_mode: str | None) -> None:
-    """Refuse to draw, and say who does.
-
-    Raises:
-        ValueError: for any render mode.
-    """
-    if render_mode is not None:
-        raise ValueError(
-            f"render_mode: wanted None, got {render_mode!r}: this environment draws no pictures; "
-            "cmc.view.playback.record makes a 3D page of a motion"
-        )
+    return found

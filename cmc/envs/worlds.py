@@ -1,109 +1,140 @@
-"""Physics of one Panda world or of many alike, seen through arrays with a leading axis.
+"""Configuration and physics of Panda worlds, seen through arrays with a leading axis.
 
-A tick lasts `substeps` physics steps; the torque is held over it (50 Hz) or computed at every
-physics step (`cmc.robot.tick`, compiled). Contact is logged both ways: the force at the end of
-the tick and the largest over its physics steps.
+A tick lasts some physics steps; the torque is held over it (50 Hz) or computed at every one of them
+(`cmc.robot.tick`, compiled). Contact is logged both ways: the force at the end of the tick and the
+largest over its physics steps.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Literal
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cmc.envs.vector import Array, set_counts, set_numbers
 from cmc.robot.osc import ControlLaw, Gains, bind, describe
-from cmc.robot.panda import DOWN, JOINTS
+from cmc.robot.panda import DOWN, FINGERTIP, JOINTS, Peg, inverse_kinematics
 from cmc.robot.tick import ROW, refresh, tick
+from cmc.theory.arrays import checked, count
 
-Array = NDArray[np.float64]
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
+@dataclass(frozen=True)
+class PandaTaskConfig:
+    """Physics, control and episode of a peg task."""
+
+    scene: str  # shipped scene, or path of an MJCF file
+    peg: Peg
+    gains: Gains
+    law: ControlLaw  # its posture is replaced by the starting pose
+    start: tuple[float, ...]  # tip at the start (3,), m
+    subgoal_low: tuple[float, ...]  # bounds of the high-level action: (3,) m, (6,) m and rad,
+    subgoal_high: tuple[float, ...]  # or (7,) rad
+    workspace_low: tuple[float, ...]  # what sub-goals are clamped to: positions (3,), m, or
+    workspace_high: tuple[float, ...]  # joint angles relative to the start (7,), rad
+    ticks: int  # length of an episode
+    command: Literal["pose", "joint"] = "pose"  # sub-goals and actions of the tip or the joints
+    start_box: tuple[float, ...] = (0.0, 0.0, 0.0)  # half-widths around `start` (3,), m
+    start_joints: float = 0.0  # half-width of the uniform error added to every joint, rad
+    increments: bool = False  # sub-goals are increments from the current tip pose, or absolute
+    tilt_limit: float = 0.5  # largest rotation of the target from pointing straight down, rad
+    u_limit: tuple[float, ...] = (1.0,) * 6  # action of 1: (6,) m/s^2, rad/s^2, or (7,) N m
+    joint_stiffness: float = 1.0  # K_p of the joint controller, N m/rad ("joint" only)
+    horizon: int = 20  # ticks between sub-goals
+    tick: float = 0.02  # control period, s
+    timestep: float = 0.002  # physics step, s
+    hold: bool = True  # torque held over a tick (50 Hz), or computed at every physics step
+
+    def __post_init__(self) -> None:
+        for name, kind in (("peg", Peg), ("gains", Gains), ("law", ControlLaw)):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name}: wanted a {kind.__name__}, got {getattr(self, name)!r}")
+        if self.command not in ("pose", "joint"):
+            raise ValueError(f"command must be 'pose' or 'joint', got {self.command!r}")
+        set_numbers(self, "3", ("start", "start_box"))
+        set_numbers(self, str(self.low_size), ("u_limit",))
+        plain = ("start_joints", "tilt_limit", "joint_stiffness", "tick", "timestep")
+        set_numbers(self, "", plain)
+        set_counts(self, ("ticks", "horizon"))
+        for name in ("subgoal", "workspace"):
+            sides = (f"{name}_low", f"{name}_high")
+            set_numbers(self, str(np.size(getattr(self, sides[0]))), sides)
+            low, high = (np.array(getattr(self, side)) for side in sides)
+            if not (low < high).all():
+                raise ValueError(f"{name}_low must lie below {name}_high, got {low} and {high}")
+        steps = self.tick / self.timestep
+        if abs(steps - round(steps)) > 1e-9 or steps < 1:
+            raise ValueError(f"tick {self.tick} s is no multiple of timestep {self.timestep} s")
+
+    @property
+    def low_size(self) -> int:
+        """Length of the low-level action."""
+        return 6 if self.command == "pose" else JOINTS
+
+    @property
+    def high_size(self) -> int:
+        """Length of the high-level action."""
+        return len(self.subgoal_low)
+
+
 class Worlds:
-    """N worlds of one scene; every array has the leading axis N and is a live view.
+    """`num` worlds of a scene, whose contact sensors remember the physics steps of a tick.
 
-    Args:
-        model: the scene, whose contact sensors remember `substeps` physics steps.
-        gains: K_p, K_d of the task-space controller.
-        law: its form and options.
-        substeps: physics steps of a tick.
-        hold: whether the torque is held over a tick, or computed at every physics step.
-        num: N.
-        threads: that share the worlds.
-        u_limit: what an action of 1 means, (6,) m/s^2 and rad/s^2, or (7,) N m.
-        joint_stiffness: K_p of joint control, N m/rad; None for task-space control.
+    Success is a tip nearer to the goal than `near`, m, and within `box`, m, along each axis.
 
-    Attributes:
-        target, quat, target_joints: where to go: position (N, 3), m, orientation (N, 4), or joint
-            angles (N, 7), rad. After a change, `refresh`.
+    Attributes (live views, one row a world; after a change of a target, `refresh`):
+        start: joint angles that put the tip at the configuration's start, (7,), rad.
+        target: where to go, (N, 3), m; quat: (N, 4); target_joints: (N, 7), rad.
         tip: true tip (N, 3), m. nominal: tip fixed to the hand (N, 3), m.
-        tip_velocity: of the true tip, linear and angular, (N, 6), m/s and rad/s.
+        rotation: of the hand, as a rotation vector from pointing straight down, (N, 3), rad.
         signals: control error towards the target and velocity of the nominal tip, (N, 12).
         latent: y = K1 e + K2 e' (N, 6). integral: of its translation, tick by tick, (N, 6).
         force: net contact force on the peg at the end of the tick (N, 3), N.
-        peaks: over the physics steps of the tick, the largest norm of the force in N and the
-            deepest penetration in m, at least 0, (N, 2).
+        peaks: largest |force|, N, and penetration, m, of the tick's physics steps, (N, 2).
+        rows: all of that as a record of each world, `cmc.robot.tick.ROW`.
     """
 
     def __init__(
         self,
+        config: PandaTaskConfig,
         model: mujoco.MjModel,
-        gains: Gains,
-        law: ControlLaw,
-        substeps: int,
-        hold: bool,
         num: int = 1,
         threads: int = 1,
-        u_limit: ArrayLike = (1.0,) * 6,
-        joint_stiffness: float | None = None,
+        near: float = np.inf,
+        box: tuple[float, ...] = (np.inf,) * 3,
     ) -> None:
-        if num < 1 or threads < 1:
-            raise ValueError(f"wanted at least 1 of worlds and threads, got {num} and {threads}")
-        self.model, self.num = model, num
-        limit = np.zeros(JOINTS)
-        limit[: np.size(u_limit)] = u_limit
-        compliant = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, "peg_x") >= 0
-        seconds = substeps * model.opt.timestep
-        more = {"substeps": substeps, "hold": hold, "tick": seconds, "u_limit": limit}
-        more |= {"compliant": compliant, "joint": joint_stiffness is not None}
-        more |= {"joint_stiffness": joint_stiffness or 0.0}
-        self._law = describe(model, gains, law, **more)
+        c, steps = config, round(config.tick / config.timestep)
+        self.model, self.num = model, count("worlds", num)
+        self.start = inverse_kinematics(c.start, tool=FINGERTIP + c.peg.length)
+        shared = {name: getattr(c, name) for name in ("hold", "tick", "ticks", "joint_stiffness")}
+        shared |= {"substeps": steps, "joint": c.command == "joint", "near": near, "box": box}
+        shared["u_limit"] = np.resize(c.u_limit, JOINTS)
+        law = replace(c.law, posture=tuple(self.start))
+        self._law = describe(model, c.gains, law, **shared)
         self._hand = model.body("hand").id
         self.data = [mujoco.MjData(model) for _ in range(num)]
         self.rows, self._jacobians = np.zeros(num, ROW), np.zeros((num, 6, model.nv))
         for row, data in zip(self.rows, self.data, strict=True):
-            self._bind(row, data, substeps)
+            bind(row, model, data, steps)
         self._qpos, self._qvel = ([getattr(d, n) for d in self.data] for n in ("qpos", "qvel"))
-        rows = self.rows
-        self.target, self.quat, self.target_joints = (
-            rows[name] for name in ("target", "quat", "target_joints")
+        self.target, self.quat, self.target_joints, self.tip, self.nominal, self.rotation = (
+            self.rows[name]
+            for name in ("target", "quat", "target_joints", "tip", "nominal", "rotation")
         )
-        self.tip, self.nominal = rows["tip"], rows["nominal"]
-        self.tip_velocity, self.signals = rows["tip_velocity"], rows["signals"]
-        self.latent, self.integral = rows["latent"], rows["integral"]
-        self.force, self.peaks = rows["force"], rows["peaks"]
-        threads = min(threads, num)
+        self.signals, self.latent, self.integral, self.force, self.peaks = (
+            self.rows[name] for name in ("signals", "latent", "integral", "force", "peaks")
+        )
+        threads = min(count("threads", threads), num)
         self._ends = [k * num // threads for k in range(threads + 1)]
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self.quat[:] = DOWN
         self.reset(np.zeros((num, model.nq)), np.ones(num, dtype=bool))
-
-    def _bind(self, row: NDArray[np.void], data: mujoco.MjData, steps: int) -> None:
-        """Addresses in `data`: the law's, the true tip's, and the contact of the last tick.
-
-        A sensor's history is two numbers of bookkeeping, `steps` times, and a ring of values.
-        """
-        model = self.model
-        bind(row, data, int(self._law["site"][0]))
-        row["tip_pos"] = data.site_xpos[model.site("tip").id].ctypes.data
-        row["hand_mat"] = data.xmat[self._hand].ctypes.data
-        row["push"] = data.sensordata[model.sensor("peg_force").adr[0] :].ctypes.data
-        for name, sensor in (("forces", "peg_force"), ("distances", "peg_distance")):
-            start = int(model.sensor_historyadr[model.sensor(sensor).id]) + 2 + steps
-            row[name] = data.history[start:].ctypes.data
 
     @property
     def qpos(self) -> Array:
@@ -114,11 +145,6 @@ class Worlds:
     def qvel(self) -> Array:
         """Joint velocities (N, nv), a copy."""
         return np.array(self._qvel)
-
-    def rotation(self) -> Array:
-        """Orientation of the hand as a rotation vector from pointing straight down, (N, 3), rad."""
-        turn: Array = self.rows["rotation"]
-        return turn
 
     def reset(self, qpos: Array, mask: NDArray[np.bool_]) -> None:
         """Put the masked worlds at rest at `qpos` (N, nq)."""
@@ -152,18 +178,11 @@ class Worlds:
 
         Force and moment are those of the hand's present pose and last until the next push or reset;
         repeated at every tick, the force follows the tip. Zero takes it away.
-
-        Raises:
-            ValueError: on another shape, NaN or infinity.
         """
-        force = np.asarray(force, dtype=float)
-        if force.shape != (self.num, 3):
-            raise ValueError(f"push: wanted shape {(self.num, 3)}, got {force.shape}")
-        if not np.isfinite(force).all():
-            raise ValueError(f"push: wanted finite numbers, got {force.tolist()}")
+        forces = checked("push", force, "N 3", N=self.num)
         # MuJoCo applies forces at the centre of mass.
         arm = self.model.site("tip_nominal").pos - self.model.body("hand").ipos
-        for data, f in zip(self.data, force, strict=True):
+        for data, f in zip(self.data, forces, strict=True):
             lever = data.xmat[self._hand].reshape(3, 3) @ arm
             data.xfrc_applied[self._hand] = np.concatenate([f, np.cross(lever, f)])
 
@@ -180,11 +199,3 @@ class Worlds:
             mujoco.mj_setState(self.model, data, state, _STATE)
             mujoco.mj_step1(self.model, data)
         self.refresh()
-
-
-def pose_quat(rotation: Array) -> Array:
-    """Orientation (N, 4) that lies a rotation vector (N, 3) away from pointing straight down."""
-    half = np.sqrt((rotation**2).sum(-1)) / 2
-    w, (x, y, z) = np.cos(half), (rotation.T * np.sinc(half / np.pi) / 2)
-    # The product with DOWN = (0, 1, 0, 0).
-    return np.stack([-x, w, z, -y], axis=-1)

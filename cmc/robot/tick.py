@@ -1,23 +1,76 @@
 """The control law and the tick of a world, compiled: the same code for one world and for many.
 
 A world is a row of records (`ROW`): where MuJoCo keeps its arrays, where the tip is to go, and what
-was last seen of it. The law is `cmc.robot.osc`'s. All that is compiled into `tick` stands in this
-file, so that the cache of compiled code never misses a change.
+was last seen of it. The law is `cmc.robot.osc`'s. MuJoCo's C functions are called by name, which
+numba can keep in its cache, and its arrays are read by address: whoever passes one keeps the object
+behind it alive and states its size truly. All that is compiled into `tick` stands in this file, so
+that the cache never misses a change.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import mujoco
+import numba
 import numpy as np
+from llvmlite import binding
+from numba import types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from cmc.robot import compiled as mj
-from cmc.robot.compiled import compiled, view
 from cmc.robot.panda import JOINTS
+from cmc.theory.arrays import compiled
 
 Array = NDArray[np.float64]
 Record = NDArray[np.void]
+
+
+_FOLDER = Path(mujoco.__file__).parent
+_FOUND = [
+    p for name in ("libmujoco.so*", "libmujoco*.dylib", "mujoco.dll") for p in _FOLDER.glob(name)
+]
+if not _FOUND:
+    raise ImportError(f"wanted MuJoCo's library in {_FOLDER}")
+binding.load_library_permanently(str(min(_FOUND)))
+
+
+def _c(name: str, arguments: str) -> Any:
+    """MuJoCo's function of a name; arguments are addresses (p), integers (i) and numbers (n)."""
+    kinds = {"p": types.intp, "i": types.int32, "n": types.float64}
+    return types.ExternalFunction(name, types.void(*(kinds[kind] for kind in arguments)))
+
+
+mj_step = _c("mj_step", "pp")
+mj_step1 = _c("mj_step1", "pp")
+mj_step2 = _c("mj_step2", "pp")
+mj_jacSite = _c("mj_jacSite", "ppppi")
+mj_jacDot = _c("mj_jacDot", "pppppi")
+mj_mulM = _c("mj_mulM", "pppp")
+mj_solveM = _c("mj_solveM", "ppppi")
+mju_cholFactor = _c("mju_cholFactor", "pin")
+mju_cholSolve = _c("mju_cholSolve", "pppi")
+mju_mat2Quat = _c("mju_mat2Quat", "pp")
+mju_subQuat = _c("mju_subQuat", "ppp")
+mju_rotVecQuat = _c("mju_rotVecQuat", "ppp")
+mju_mulQuat = _c("mju_mulQuat", "ppp")
+mju_quat2Vel = _c("mju_quat2Vel", "ppn")
+
+
+@intrinsic
+def _pointer(context: Any, address: Any) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = context.get_value_type(signature.return_type)
+        return builder.inttoptr(arguments[0], kind)
+
+    return types.CPointer(types.float64)(types.intp), generate
+
+
+@compiled
+def view(address: int, shape: int | tuple[int, ...]) -> Any:
+    """The numbers at an address as an array of a shape."""
+    return numba.carray(_pointer(address), shape)  # type: ignore[call-arg]
 
 
 def _record(integers: str, numbers: dict[str, int]) -> np.dtype[Any]:
@@ -26,19 +79,26 @@ def _record(integers: str, numbers: dict[str, int]) -> np.dtype[Any]:
     return np.dtype([(name, np.intp) for name in integers.split()] + vectors)
 
 
+ROOM = 16
+"""Joints of a scene that are observed, the first ones."""
 #: One world: addresses of MuJoCo's arrays, where it is to go, and what was last observed of it.
+#: `numbers`: distance to the goal, m; tilt, rad; contact force, and the largest of the tick, N;
+#: deepest penetration, m; minus the distances to the sub-goal, m (or rad, of joints), and rad.
+#: `flags`: terminated (never), truncated (the time is up), success.
 ROW = _record(
     "data qpos qvel ctrl bias passive site_pos site_mat tip_pos hand_mat push forces distances",
-    {"target": 3, "quat": 4, "target_joints": JOINTS, "turn": 4, "nominal": 3}
+    {"target": 3, "quat": 4, "target_joints": JOINTS, "goal": 3, "turn": 4, "nominal": 3}
     | {"tip": 3, "rotation": 3, "tip_velocity": 6, "signals": 12, "latent": 6, "integral": 6}
-    | {"force": 3, "peaks": 2},
+    | {"joints": ROOM, "joint_velocity": ROOM, "joint_error": JOINTS, "left": 0, "ticks": 0}
+    | {"force": 3, "peaks": 2, "numbers": 7, "flags": 3},
 )
-#: What all worlds share: the model, gains and law, and how a tick is made of physics steps.
+#: What all worlds share: the model, gains and law, how a tick is made of physics steps, the length
+#: of an episode in ticks, and what counts as success (see `cmc.envs.panda_task`).
 LAW = _record(
     "model nv site body substeps hold joint acceleration split drift compliant",
-    {"kp": 6, "kd": 6, "K1": 6, "K2": 6, "posture": JOINTS, "u_limit": JOINTS}
+    {"kp": 6, "kd": 6, "K1": 6, "K2": 6, "posture": JOINTS, "u_limit": JOINTS, "box": 3}
     | dict.fromkeys(("error_limit", "posture_stiffness", "posture_damping", "pivot_floor"), 0)
-    | dict.fromkeys(("tick", "joint_stiffness"), 0),
+    | dict.fromkeys(("tick", "joint_stiffness", "ticks", "near"), 0),
 )
 _UP = np.array([0.0, -1.0, 0.0, 0.0])  # times it, a turn is told from pointing straight down
 
@@ -67,25 +127,24 @@ def _add_transposed(matrix: Array, vector: Array, out: Array) -> None:
 @compiled
 def _solve(matrix: Array, right: Array, floor: float) -> None:
     """Solve in place with a positive matrix whose pivots are kept from zero; overwrites both."""
-    mj.cholFactor(matrix.ctypes.data, len(right), floor)
-    mj.cholSolve(right.ctypes.data, matrix.ctypes.data, right.ctypes.data, len(right))
+    mju_cholFactor(matrix.ctypes.data, len(right), floor)
+    mju_cholSolve(right.ctypes.data, matrix.ctypes.data, right.ctypes.data, len(right))
 
 
 @compiled
 def _observe(w: Any, law: Any, jac: Array) -> None:
     """Pose, Jacobian (6, nv) of the driven joints and velocity of the site; the true tip."""
-    mj.jacSite(law.model, w.data, jac.ctypes.data, jac[3:].ctypes.data, law.site)
+    mj_jacSite(law.model, w.data, jac.ctypes.data, jac[3:].ctypes.data, law.site)
     jac[:, JOINTS:] = 0.0  # sliders and the peg's mount have no motor
     qvel = view(w.qvel, law.nv)
     w.nominal[:] = view(w.site_pos, 3)
-    mj.mat2Quat(w.turn.ctypes.data, w.site_mat)
+    mju_mat2Quat(w.turn.ctypes.data, w.site_mat)
     _times(jac, qvel, w.signals[6:])
     w.tip[:], w.tip_velocity[:] = w.nominal, w.signals[6:]
     if law.compliant:
         w.tip[:], axes = view(w.tip_pos, 3), view(w.hand_mat, (3, 3))
         for i in range(3):
-            slide = axes[i, 0] * qvel[JOINTS] + axes[i, 1] * qvel[JOINTS + 1]
-            w.tip_velocity[i] += slide
+            w.tip_velocity[i] += axes[i, 0] * qvel[JOINTS] + axes[i, 1] * qvel[JOINTS + 1]
 
 
 @compiled
@@ -93,8 +152,8 @@ def _aim(w: Any, law: Any) -> None:
     """Pose error e = (x_d - x, rotation vector from x to x_d in the world frame) and y."""
     error, local = w.signals[:6], np.empty(3)
     error[:3] = w.target - w.nominal
-    mj.subQuat(local.ctypes.data, w.quat.ctypes.data, w.turn.ctypes.data)  # in the site's frame
-    mj.rotVecQuat(error[3:].ctypes.data, local.ctypes.data, w.turn.ctypes.data)
+    mju_subQuat(local.ctypes.data, w.quat.ctypes.data, w.turn.ctypes.data)  # in the site's frame
+    mju_rotVecQuat(error[3:].ctypes.data, local.ctypes.data, w.turn.ctypes.data)
     length = np.sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
     if length > law.error_limit:
         error[:3] *= law.error_limit / length
@@ -112,7 +171,7 @@ def _torque(w: Any, law: Any, jac: Array, reference: Array, tau: Array) -> None:
     if law.drift:
         rate, drift = np.empty((6, nv)), np.empty(6)
         point = w.nominal.ctypes.data
-        mj.jacDot(law.model, w.data, rate.ctypes.data, rate[3:].ctypes.data, point, law.body)
+        mj_jacDot(law.model, w.data, rate.ctypes.data, rate[3:].ctypes.data, point, law.body)
         _times(rate[:, :JOINTS], dq, drift)
         r -= drift
     inverse = np.empty((6, 6))
@@ -121,11 +180,11 @@ def _torque(w: Any, law: Any, jac: Array, reference: Array, tau: Array) -> None:
         r -= undo
         _solve(inverse, r, law.pivot_floor)
         _add_transposed(jac, r, qn)
-        mj.mulM(law.model, w.data, tau.ctypes.data, qn.ctypes.data)  # tau_task_space_control
+        mj_mulM(law.model, w.data, tau.ctypes.data, qn.ctypes.data)  # tau_task_space_control
     else:
         solved = np.empty((6, nv))
-        mj.mulM(law.model, w.data, tau.ctypes.data, qn.ctypes.data)
-        mj.solveM(law.model, w.data, solved.ctypes.data, jac.ctypes.data, 6)
+        mj_mulM(law.model, w.data, tau.ctypes.data, qn.ctypes.data)
+        mj_solveM(law.model, w.data, solved.ctypes.data, jac.ctypes.data, 6)
         _times_transposed(solved, jac, inverse)  # J M^-1 J^T
         if law.split:
             translation, rotation = inverse[:3, :3].copy(), inverse[3:, 3:].copy()
@@ -154,13 +213,26 @@ def _command(w: Any, law: Any, jac: Array, u: Array, tau: Array) -> None:
 
 
 @compiled
+def _length(vector: Array) -> Any:
+    return np.sqrt((vector * vector).sum())
+
+
+@compiled
 def _look(w: Any, law: Any, jac: Array) -> None:
     """Everything that is seen of a world whose derived quantities are current (`mj_step1`)."""
     _observe(w, law, jac)
     _aim(w, law)
-    down = np.empty(4)
-    mj.mulQuat(down.ctypes.data, w.turn.ctypes.data, _UP.ctypes.data)
-    mj.quat2Vel(w.rotation.ctypes.data, down.ctypes.data, 1.0)
+    down, n, numbers = np.empty(4), min(law.nv, ROOM), w.numbers
+    mju_mulQuat(down.ctypes.data, w.turn.ctypes.data, _UP.ctypes.data)
+    mju_quat2Vel(w.rotation.ctypes.data, down.ctypes.data, 1.0)
+    w.joints[:n], w.joint_velocity[:n] = view(w.qpos, n), view(w.qvel, n)
+    w.joint_error[:] = w.target_joints - w.joints[:JOINTS]
+    away = w.goal - w.tip
+    numbers[0], numbers[1], numbers[2] = _length(away), _length(w.rotation), _length(w.force)
+    numbers[3:5], numbers[6] = w.peaks, -_length(w.signals[3:6])
+    numbers[5] = -_length(w.joint_error) if law.joint else -_length(w.target - w.tip)
+    w.flags[1] = w.ticks >= law.ticks
+    w.flags[2] = numbers[0] < law.near and (np.abs(away) < law.box).all()
 
 
 @compiled
@@ -190,16 +262,18 @@ def tick(rows: Record, laws: Record, jacs: Array, actions: Array, start: int, st
             u[:] = np.abs(u) * np.sign(w.target_joints - view(w.qpos, JOINTS))
         for step in range(law.substeps):
             if step and law.hold:
-                mj.step(law.model, w.data)
+                mj_step(law.model, w.data)
                 continue
             if step:
-                mj.step1(law.model, w.data)
+                mj_step1(law.model, w.data)
                 _observe(w, law, jac)
             _command(w, law, jac, u, tau)
             view(w.ctrl, JOINTS)[:] = tau[:JOINTS]
-            mj.step2(law.model, w.data)
-        mj.step1(law.model, w.data)
+            mj_step2(law.model, w.data)
+        mj_step1(law.model, w.data)
         _contact(w, law.substeps)
+        w.left -= law.tick
+        w.ticks += 1.0
         _look(w, law, jac)
         w.integral[:3] += law.tick * w.latent[:3]  # I_k = I_{k-1} + h y_k
     return True

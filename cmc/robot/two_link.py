@@ -14,22 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cmc.theory.arrays import checked
+
 Array = NDArray[np.float64]
 TorqueLaw = Callable[[float, Array, Array], Array]
 
 
-class SingularPoseError(ValueError):
-    """A straight or folded arm, where no torque gives the tip every acceleration."""
-
-
 @dataclass(frozen=True)
 class TwoLinkArm:
-    """Uniform links of given lengths and masses; every method takes (..., 2) arrays.
+    """Uniform links, m and kg, under gravity along -y, m/s^2; methods take (..., 2) arrays.
 
-    Attributes:
-        lengths: m.
-        masses: kg; the inertia of a link about its center is m l^2 / 12.
-        gravity: m/s^2 along -y.
+    The inertia of a link about its center is m l^2 / 12.
     """
 
     lengths: tuple[float, float] = (0.4, 0.3)
@@ -38,36 +33,28 @@ class TwoLinkArm:
 
     def __post_init__(self) -> None:
         for name in ("lengths", "masses"):
-            pair = np.asarray(getattr(self, name), dtype=float)
-            if pair.shape != (2,) or not (np.isfinite(pair).all() and (pair > 0).all()):
-                raise ValueError(f"{name} must be two positive numbers, got {pair}")
+            checked(name, getattr(self, name), "2", above=0.0)
+
+    def _along(self, q: ArrayLike, first: ArrayLike, second: ArrayLike) -> Array:
+        """Sum of a vector along each link, of the given sizes, (..., 2)."""
+        q = np.asarray(q, dtype=float)
+        a, b = q[..., 0], q[..., 0] + q[..., 1]
+        x, y = first * np.cos(a) + second * np.cos(b), first * np.sin(a) + second * np.sin(b)
+        return np.stack([x, y], -1)
 
     def position(self, q: ArrayLike) -> Array:
         """Position of the tip, (..., 2), m."""
-        q = np.asarray(q, dtype=float)
-        first, both = q[..., 0], q[..., 0] + q[..., 1]
-        l1, l2 = self.lengths
-        return np.stack(
-            [l1 * np.cos(first) + l2 * np.cos(both), l1 * np.sin(first) + l2 * np.sin(both)], -1
-        )
+        return self._along(q, *self.lengths)
 
     def jacobian(self, q: ArrayLike) -> Array:
         """Jacobian J of the tip, x' = J q', (..., 2, 2), m."""
-        q = np.asarray(q, dtype=float)
-        tip, l2 = self.position(q), self.lengths[1]
-        both = q[..., 0] + q[..., 1]
-        second = np.stack([-l2 * np.sin(both), l2 * np.cos(both)], -1)
-        return np.stack([np.stack([-tip[..., 1], tip[..., 0]], -1), second], -1)
+        columns = np.stack([self.position(q), self._along(q, 0.0, self.lengths[1])], -1)
+        return np.stack([-columns[..., 1, :], columns[..., 0, :]], -2)  # a turn by 90 degrees
 
     def jacobian_rate(self, q: ArrayLike, dq: ArrayLike) -> Array:
         """J' q', the tip acceleration at q'' = 0, (..., 2), m/s^2: centripetal terms only."""
-        q, dq = np.asarray(q, dtype=float), np.asarray(dq, dtype=float)
-        first, both = q[..., 0], q[..., 0] + q[..., 1]
-        l1, l2 = self.lengths
-        w1, w2 = l1 * dq[..., 0] ** 2, l2 * (dq[..., 0] + dq[..., 1]) ** 2
-        return -np.stack(
-            [w1 * np.cos(first) + w2 * np.cos(both), w1 * np.sin(first) + w2 * np.sin(both)], -1
-        )
+        dq, (l1, l2) = np.asarray(dq, dtype=float), self.lengths
+        return -self._along(q, l1 * dq[..., 0] ** 2, l2 * (dq[..., 0] + dq[..., 1]) ** 2)
 
     def inertia(self, q: ArrayLike) -> Array:
         """Mass matrix H(q), (..., 2, 2), kg m^2."""
@@ -100,13 +87,11 @@ class TwoLinkArm:
         engineer who does not know the masses.
 
         Raises:
-            SingularPoseError: where |det J| is below a thousandth of its largest value.
+            ValueError: where |det J| is below a thousandth of its largest value.
         """
         jac = self.jacobian(q)
         if np.any(np.abs(np.linalg.det(jac)) < 1e-3 * self.lengths[0] * self.lengths[1]):
-            raise SingularPoseError(
-                f"the arm is straight or folded at q = {np.asarray(q)}: J has no inverse"
-            )
+            raise ValueError(f"the arm is straight or folded at q = {q!r}: J has no inverse")
         wanted = np.asarray(p, dtype=float) - self.jacobian_rate(q, dq)
         ddq = np.linalg.solve(jac, wanted[..., None])
         return (self.inertia(q) @ ddq)[..., 0] + self.bias(q, dq)  # tau_task_space_control
@@ -117,8 +102,7 @@ class TwoLinkArm:
         Raises:
             ValueError: for points outside the annulus that the arm reaches.
         """
-        x = np.asarray(x, dtype=float)
-        l1, l2 = self.lengths
+        x, (l1, l2) = np.asarray(x, dtype=float), self.lengths
         cosine = (np.sum(x**2, axis=-1) - l1**2 - l2**2) / (2 * l1 * l2)
         if not np.all(np.abs(cosine) <= 1.0):
             raise ValueError(f"the tip reaches {abs(l1 - l2):g} to {l1 + l2:g} m, got {x}")
@@ -130,24 +114,14 @@ class TwoLinkArm:
 def simulate(
     arm: TwoLinkArm, law: TorqueLaw, q: ArrayLike, dq: ArrayLike, times: ArrayLike
 ) -> tuple[Array, Array]:
-    """Motion of the arm under torques held between the given times, by RK4 within each interval.
+    """Angles and rates at the times, (T, ..., 2) each, from `q` and `dq`, (..., 2).
 
-    Args:
-        arm: the real arm.
-        law: torque (t, q, q') -> (..., 2), N m, asked once per interval.
-        q: first angles (..., 2), rad.
-        dq: first rates (..., 2), rad/s.
-        times: (T,), s; every interval is one Runge-Kutta step.
-
-    Returns:
-        Angles and rates at the times, (T, ..., 2) each.
+    The torque `law(t, q, q')`, N m, is held between two times, each one Runge-Kutta step (RK4).
     """
     times = np.asarray(times, dtype=float)
-    state = np.stack([np.asarray(q, dtype=float), np.asarray(dq, dtype=float)])
-    path = np.empty((len(times), *state.shape))
-    path[0] = state
-    for k, h in enumerate(np.diff(times)):
-        tau = law(float(times[k]), state[0], state[1])
+    path = [np.stack([np.asarray(q, dtype=float), np.asarray(dq, dtype=float)])]
+    for t, h in zip(times, np.diff(times), strict=False):
+        tau, state = law(float(t), *path[-1]), path[-1]
 
         def rate(s: Array, tau: Array = tau) -> Array:
             return np.stack([s[1], arm.acceleration(s[0], s[1], tau)])
@@ -156,6 +130,6 @@ def simulate(
         k2 = rate(state + h / 2 * k1)
         k3 = rate(state + h / 2 * k2)
         k4 = rate(state + h * k3)
-        state = state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        path[k + 1] = state
-    return path[:, 0], path[:, 1]
+        path.append(state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+    moved = np.array(path)
+    return moved[:, 0], moved[:, 1]

@@ -1,10 +1,10 @@
-"""Test the kept policies of a study: every row of its tables, from checkpoints."""
+"""Test the kept policies of a study, and ship what a run has: policies, and rows of tables."""
 
 from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,35 +33,32 @@ def evaluate(
     checkpoints: Folder = None,
     progress: Progress | None = None,
 ) -> Tables:
-    """Test trained policies; finished tests are kept and not repeated.
+    """Test trained policies; rows by table, as `cmc.results` describes them.
 
     Args:
         study: whose policies.
         names: methods; all that have a checkpoint or need none if None.
         trajectories: of each seed in the largest tests, others in proportion; the study's if None.
-        folder: where tests are kept; by default `runs/STUDY/results`.
+        folder: where finished tests are kept and not repeated; by default `runs/STUDY/results`.
         checkpoints: folder of checkpoint files; the shipped ones if None.
         progress: called with (tests done, tests in all, what is next).
-
-    Returns:
-        Rows by table, as `cmc.results` describes them.
-
-    Raises:
-        ValueError: for an unknown method, or less than one trajectory.
-        CheckpointError: if a checkpoint is missing, damaged or of another study.
     """
     if trajectories is not None and trajectories < 1:
         raise ValueError(f"trajectories: wanted at least 1, got {trajectories}")
-    there = [n for n, m in study.methods.items() if not m.trained or _file(study, n, checkpoints)]
-    wanted = there if names is None else [*names]
+    files = {
+        name: find(study, name, checkpoints) if study.method(name).trained else None
+        for name in (study.methods if names is None else names)
+    }
+    if names is None:
+        files = {name: file for name, file in files.items() if file is None or file.is_file()}
     kept = Path(folder) if folder is not None else Path("runs") / study.name / "results"
-    plans = {name: _plan(study, name, checkpoints, trajectories) for name in wanted}
+    plans = {name: _plan(study, name, file, trajectories) for name, file in files.items()}
     total, done = sum(len(plan) for plan in plans.values()), 0
     tables: Tables = defaultdict(list)
     for name, plan in plans.items():
-        path = find(study, name, checkpoints) if study.method(name).trained else None
-        file, weights = kept / f"{name}.json", path.read_bytes() if path else b""
-        ready = store.read_json(file) if file.is_file() else {}
+        file, cache = files[name], kept / f"{name}.json"
+        weights = file.read_bytes() if file else b""
+        ready = store.read_json(cache) if cache.is_file() else {}
         for test, mark in plan:
             if progress is not None:
                 progress(done, total, f"{name}, {study.unit} {mark}, {test.name}")
@@ -70,30 +67,28 @@ def evaluate(
             key = hashlib.sha256(weights + what).hexdigest()
             if key not in ready:
                 with single_thread():
-                    ready[key] = _test(study, name, test, mark, path)
-                store.write_json(file, ready)
+                    ready[key] = _test(study, name, test, mark, file)
+                store.write_json(cache, ready)
             for table, rows in ready[key].items():
                 tables[table] += rows
             done += 1
-        if path is not None:
-            tables["curves"] += _curve(study, name, path)
+        if file is not None:
+            tables["curves"] += _curve(study, name, file)
     if progress is not None:
         progress(done, total, "done")
     return dict(tables)
 
 
-def _file(study: Study, name: str, checkpoints: Folder) -> bool:
-    return find(study, name, checkpoints).is_file()
+def _marks(file: Path | None) -> list[int]:
+    """Kept policies of a file; 0 for fixed gains, which have none."""
+    return [0] if file is None else marks_of(store.load_checkpoint(file)[0])
 
 
 def _plan(
-    study: Study, name: str, checkpoints: Folder, trajectories: int | None
+    study: Study, name: str, file: Path | None, trajectories: int | None
 ) -> list[tuple[Test, int]]:
     """The tests of a method and the kept policies that they look at."""
-    marks = [0]
-    if study.method(name).trained:
-        marks = marks_of(store.load_checkpoint(find(study, name, checkpoints))[0])
-    largest = max(test.number for test in study.tests)
+    largest, marks = max(test.number for test in study.tests), _marks(file)
     share = 1.0 if trajectories is None else trajectories / largest
     return [
         (replace(test, number=max(1, round(share * test.number))), mark)
@@ -103,40 +98,27 @@ def _plan(
     ]
 
 
-def _test(study: Study, name: str, test: Test, mark: int, path: Path | None) -> Tables:
+def _test(study: Study, name: str, test: Test, mark: int, file: Path | None) -> Tables:
     """Rows of one test of one kept policy, with what they are about in front."""
-    found = load(study, name, mark if path else None, path=path)
-    marks = marks_of(store.load_checkpoint(path)[0]) if path else [0]
+    found, marks = load(study, name, mark if file else None, path=file), _marks(file)
     about: dict[str, Any] = {"method": name, "title": study.method(name).title}
     about |= {"test": test.name, study.unit: mark, "last": mark == marks[-1]}
     config = test.change(study.config_of(name))
     tables = study.judge(config, found.policy, len(found.seeds), test)
-    shown = {"tests", "certificates"} if mark not in study.shown(marks) else set(tables)
-    return {
-        table: [
-            about | row | ({"seed": found.seeds[row["seed"]]} if "seed" in row else {})
-            for row in plain_rows(rows)
-        ]
-        for table, rows in tables.items()
-        if table in shown
-    }
+    shown = set(tables) if mark in study.shown(marks) else {"tests", "certificates"}
+
+    def plain(row: dict[str, Any]) -> dict[str, Any]:
+        """Plain numbers, without those that are missing; the seed in place of its position."""
+        row = {k: v.item() if isinstance(v, np.generic) else v for k, v in row.items()}
+        seed = {"seed": found.seeds[row["seed"]]} if "seed" in row else {}
+        return about | {k: v for k, v in row.items() if v is not None} | seed
+
+    return {name: [plain(row) for row in rows] for name, rows in tables.items() if name in shown}
 
 
-def plain_rows(rows: Rows) -> Rows:
-    """Rows of plain numbers, without those that are missing."""
-    return [
-        {
-            key: value.item() if isinstance(value, np.generic) else value
-            for key, value in row.items()
-            if value is not None
-        }
-        for row in rows
-    ]
-
-
-def _curve(study: Study, name: str, path: Path) -> Rows:
+def _curve(study: Study, name: str, file: Path) -> Rows:
     """The learning curve, averaged into at most `CURVE` points."""
-    tensors, record = store.load_checkpoint(path, study=study.name, method=name)
+    tensors, record = store.load_checkpoint(file, study=study.name, method=name)
     values = tensors[f"{study.gain}s"]
     parts = np.array_split(values, min(CURVE, len(values)))
     last = marks_of(tensors)[-1]
@@ -149,19 +131,65 @@ def _curve(study: Study, name: str, path: Path) -> Rows:
     ]
 
 
-def summary(study: Study, tables: Tables) -> list[str]:
+def summary(tables: Tables) -> list[str]:
     """A line for each method about its last policies in the nominal test: means over seeds."""
     data = results.at(pd.DataFrame(tables["tests"]))
-    shares = [key for key in ("success", "touched", "oscillation", "drift") if key in data]
-    figures = [key for key in ("error_f", "return", "largest_N") if key in data]
-    found = {key: results.share(data, key, "title") for key in shares}
-    found |= {key: results.spread(data, key, "title") for key in figures}
-    lines = []
-    for title in data["title"].unique():
-        parts = []
-        for key, rows in found.items():
-            mean, low, high = rows.loc[title, ["mean", "low", "high"]]
-            unit = " %" if key in shares else ""
-            parts.append(f"{key} {mean:.4g}{unit} [{low:.3g}, {high:.3g}]")
-        lines.append(f"{title}: {', '.join(parts)}")
-    return lines
+    shares = ("success", "touched", "oscillation", "drift")
+    keys = [key for key in (*shares, "error_f", "return", "largest_N") if key in data]
+    lines: dict[str, list[str]] = defaultdict(list)
+    for key in keys:
+        found = (results.share if key in shares else results.spread)(data, key, "title")
+        unit = " %" if key in shares else ""
+        for title, row in found.iterrows():
+            ends = f"[{row['low']:.3g}, {row['high']:.3g}]"
+            lines[str(title)].append(f"{key} {row['mean']:.4g}{unit} {ends}")
+    return [f"{title}: {', '.join(parts)}" for title, parts in lines.items()]
+
+
+def ship(
+    study: Study,
+    folder: str | Path,
+    assets: str | Path = "assets",
+    *,
+    complete: Collection[str] = (),
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Test every method of a run and put its policies and tables among the assets.
+
+    The last policy of each method goes to `assets/checkpoints`, bit by bit, with the run's record
+    beside it as JSON; of methods in `complete` all kept policies go. Their rows replace those of
+    the same method in `assets/results`. Finished tests are kept in `FOLDER/results`.
+
+    Returns:
+        The files written.
+    """
+    for name in complete:
+        study.method(name)
+    fixed = [name for name, method in study.methods.items() if not method.trained]
+    there = {name: find(study, name, folder) for name in study.methods if name not in fixed}
+    files = {name: file for name, file in there.items() if file.is_file()}
+    if there and not files:
+        raise FileNotFoundError(f"no checkpoint of {study.name} in {folder}")
+    names, kept = [*files, *fixed], Path(folder) / "results"
+    tables = evaluate(study, names, folder=kept, checkpoints=folder, progress=progress)
+    written, seeds = [], [0]
+    for name, file in files.items():
+        tensors, record = store.load_checkpoint(file, study=study.name, method=name)
+        earlier = () if name in complete else marks_of(tensors)[:-1]
+        unwanted = tuple(f"{mark:08d}." for mark in earlier)
+        chosen = {key: value for key, value in tensors.items() if not key.startswith(unwanted)}
+        target = Path(assets) / "checkpoints" / file.name
+        written.append(store.save_checkpoint(target, chosen, record))
+        store.write_json(target.with_suffix(".json"), record)
+        seeds = max(seeds, record["seeds"], key=len)
+    made = store.provenance(f"python -m cmc ship {study.name} FOLDER", seeds)
+    for table, rows in tables.items():
+        target = Path(assets) / "results" / results.file_name(study.name, table)
+        new = pd.DataFrame(rows)
+        if target.is_file():
+            old = results.read(target)
+            new = pd.concat([old[~old["method"].isin(names)], new], ignore_index=True)
+        order = {name: k for k, name in enumerate(study.methods)}
+        new = new.sort_values("method", key=lambda m: m.map(order), kind="stable")
+        written.append(results.write(target.parent, table, new, {"study": study.name, **made}))
+    return written

@@ -1,9 +1,9 @@
 """Where does learning a low level pay? On the latent model, against gains found by grid search.
 
-`python -m cmc.studies.low_level` writes `assets/results/low_level.csv`. Every low level is judged
-by the mean cost of segments of the latent model (`cmc.learning.latent`) of peg push, in settings
-that its designer may not know: actions that come late, a tool that is heavier or lighter than the
-gains were made for, a stronger constant push, a higher price on force beyond 1 N. Compared are
+`python -m cmc evaluate low_level` computes the table. Every low level is judged by the mean cost of
+segments of the latent model (`cmc.learning.latent`) of peg push, in settings that its designer may
+not know: actions that come late, a tool that is heavier or lighter than the gains were made for, a
+stronger constant push, a higher price on force beyond 1 N. Compared are
 
 - `start`: the capped network as it starts, slope .3;
 - `learned`: the same after `UPDATES` steps through the setting's model, five seeds;
@@ -19,22 +19,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from cmc import results, store
 from cmc.learning.latent import LatentConfig, LatentLow, LatentModel, Rollouts
 from cmc.learning.state import single_thread
 from cmc.studies.peg_push import STUDY
+from cmc.studies.study import Array
 from cmc.studies.two_level_arms import capped_actor
 
-Array = NDArray[np.float64]
 UPDATES, TUNED, JUDGED = 300, 128, 1024
 """Learning steps; segments that gains are searched on, and that all are judged on."""
 P_GRID = (0.3, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 18.0, 24.0, 28.0)
@@ -53,11 +50,7 @@ loss."""
 
 
 class Gains(nn.Module):
-    """tanh(k_1 y + k_2 integral of y) for many gains at once.
-
-    Args:
-        gains: (candidates, n, 2).
-    """
+    """tanh(k_1 y + k_2 integral of y) for many gains (candidates, n, 2) at once."""
 
     def __init__(self, gains: Array) -> None:
         super().__init__()
@@ -88,29 +81,22 @@ def segments(world: Rollouts, number: int, seed: int) -> tuple[Tensor, Tensor, T
 
 
 @torch.no_grad()
-def judge(world: Rollouts, actor: nn.Module, copies: int) -> Array:
-    """Mean cost on fresh segments, (copies,)."""
-    parts = (part.expand(copies, -1, -1) for part in segments(world, JUDGED, 2))
+def cost(world: Rollouts, actor: nn.Module, copies: int, number: int, seed: int) -> Array:
+    """Mean cost on the same segments for each of the actor's copies, (copies,)."""
+    parts = (part.expand(copies, -1, -1) for part in segments(world, number, seed))
     return world.cost(actor, *parts).double().numpy()
 
 
-@torch.no_grad()
-def search(world: Rollouts, limit: Array, tick: float) -> Array:
-    """Gains (6, 2) by grid search, one axis after the other and twice around.
-
-    Args:
-        world: the setting.
-        limit: of k_1 + k_2 tick, (6,).
-        tick: control period, s.
-    """
-    known, gains = segments(world, TUNED, 1), np.tile([3.0, 0.0], (6, 1))
+def search(world: Rollouts) -> Array:
+    """Gains (6, 2) by grid search below the cap, one axis after the other and twice around."""
+    config, gains = STUDY.config_of("ctd3"), np.tile([3.0, 0.0], (6, 1))
     for axis in (*range(6), *range(6)):
         integrals = I_GRID if axis < 3 else (0.0,)  # there is no integral of rotations
-        pairs = [(p, i) for p in P_GRID for i in integrals if p + i * tick <= limit[axis]]
+        pairs = np.array([(p, i) for p in P_GRID for i in integrals])
+        pairs = pairs[pairs @ [1.0, config.task.tick] <= config.slope_cap()[axis]]
         tried = np.tile(gains, (len(pairs), 1, 1))
         tried[:, axis] = pairs
-        cost = world.cost(Gains(tried), *(part.expand(len(pairs), -1, -1) for part in known))
-        gains = tried[int(cost.argmin())]
+        gains = tried[cost(world, Gains(tried), len(pairs), TUNED, 1).argmin()]
     return gains
 
 
@@ -118,11 +104,11 @@ def learn(world: Rollouts, seeds: Sequence[int], updates: int) -> tuple[Array, A
     """Costs of the network at its start and after learning, (seeds,) each."""
     actor = capped_actor(STUDY.config_of("ctd3"), seeds)
     low = LatentLow(actor, seeds, world.model, world.horizon, world.config)
-    first = judge(world, actor, len(seeds))
+    first = cost(world, actor, len(seeds), JUDGED, 2)
     for update in range(updates):
         drawn = [segments(world, world.config.batch, 1000 + 10**6 * s + update) for s in seeds]
         low.learn(*(torch.cat(part) for part in zip(*drawn, strict=True)))
-    return first, judge(world, actor, len(seeds))
+    return first, cost(world, actor, len(seeds), JUDGED, 2)
 
 
 def table(
@@ -131,37 +117,17 @@ def table(
     updates: int = UPDATES,
 ) -> pd.DataFrame:
     """A row for each setting (`test`), method and seed, with its `cost`."""
-    config, rows = STUDY.config_of("ctd3"), []
-    limit, tick = config.slope_cap(), config.task.tick
+    rows = []
     with single_thread():
-        nominal = search(rollouts(), limit, tick)
+        nominal = search(rollouts())
         for setting in settings:
             world = rollouts(**SETTINGS[setting])
-            start, learned = learn(world, list(seeds), updates)
-            both = np.stack([nominal, search(world, limit, tick)])
-            gains = judge(world, Gains(both), 2)
-            for method, costs in (
-                ("start", start),
-                ("learned", learned),
-                ("nominal gain", gains[:1]),
-                ("searched gain", gains[1:]),
-            ):
+            found = dict(zip(("start", "learned"), learn(world, list(seeds), updates), strict=True))
+            gains = cost(world, Gains(np.stack([nominal, search(world)])), 2, JUDGED, 2)
+            found |= {"nominal gain": gains[:1], "searched gain": gains[1:]}
+            for method, costs in found.items():
                 row = {"method": method, "title": method, "test": setting, "last": True}
                 row["step"] = updates if method == "learned" else 0
-                rows += [
-                    {**row, "seed": int(seed), "cost": float(cost)}
-                    for seed, cost in zip(seeds, costs, strict=False)
-                ]
+                each = zip(seeds, costs.tolist(), strict=False)
+                rows += [{**row, "seed": seed, "cost": value} for seed, value in each]
     return pd.DataFrame(rows)
-
-
-def main() -> None:
-    """Command line."""
-    found = table()
-    made = store.provenance("python -m cmc.studies.low_level", list(range(5)))
-    print(found.groupby(["test", "method"], sort=False).cost.agg(["mean", "min", "max"]))
-    print(results.write(Path("assets/results"), "tests", found, {"study": "low_level", **made}))
-
-
-if __name__ == "__main__":
-    main()

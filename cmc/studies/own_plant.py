@@ -1,27 +1,25 @@
 """Peers on a plant that is not the paper's: two tanks, one budget, five ways to control them.
 
-    python -m cmc.studies.own_plant       # writes assets/peers/own_plant.csv
-
-Every learner sees s = (z, int z) in reversed order, adds its action to the same u0, and has the
-same critic, noise, seeds and number of steps. "Shifted" plants: pumps 0.5 to 3 times as strong,
-outlets 0.7 to 1.4 times as wide, drawn log-uniformly. A test is unstable if a level still moves by
-over 5 cm in its last quarter, and off if it rests over 5 cm from its goal, as it must where a pump
-is too weak. All of it is our choice: the paper has no such plant.
+`python -m cmc evaluate own_plant` computes the table, which lesson 13 shows. Every learner sees
+s = (z, int z) in reversed order, adds its action to the same u0, and has the same critic, noise,
+seeds and number of steps. "Shifted" plants: pumps 0.5 to 3 times as strong, outlets 0.7 to 1.4
+times as wide, drawn log-uniformly. A test is unstable if a level still moves by over 5 cm in its
+last quarter, and off if it rests over 5 cm from its goal, as it must where a pump is too weak. All
+of it is our choice: the paper has no such plant.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import control
 import numpy as np
 import pandas as pd
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from cmc import store
 from cmc.envs.auxiliary_space import AuxiliarySpaceVectorWrapper
 from cmc.envs.plant_env import PlantVectorEnv
 from cmc.learning.ppo import PPO, PPOConfig
@@ -33,11 +31,10 @@ from cmc.policies import (
     ModularPolicy,
     PositiveNetwork,
 )
+from cmc.studies.study import Array
 from cmc.theory.certify import certify
 from cmc.theory.combinations import transforms_that_fit
 from cmc.theory.exact import Region
-
-Array = NDArray[np.float64]
 
 GOAL, H, STEPS = np.ones(2), 0.25, 48  # m, min, steps of an episode
 SEEDS, EACH, UPDATES = (0, 1, 2), 16, 45
@@ -95,16 +92,6 @@ class LQR(nn.Module):
         return -s @ self.K.T
 
 
-def build(name: str) -> nn.Module:
-    """The policy of a method, all seeds side by side."""
-    if name == "cppo":
-        network = PositiveNetwork(2, hidden=(16, 16), seeds=SEEDS, slope_min=FLOOR, slope_max=CAP)
-        return ModularPolicy(network)
-    if name == "convex":
-        return ModularPolicy(ConvexGradientNetwork(2, seeds=SEEDS))
-    return DirectPolicy(JointNetwork(2, inputs=4, seeds=SEEDS))
-
-
 def of_seed(policy: nn.Module, k: int) -> Any:
     """One seed's a as a function of s (..., 2, 2), in double precision on numpy arrays."""
 
@@ -150,40 +137,43 @@ def certified(action: Any) -> float:
     return 0.0
 
 
-METHODS = {
-    "ppo": "PPO",
-    "penalty": "PPO with a Jacobian penalty",
-    "cppo": "C-PPO",
-    "convex": "convex-gradient PI",
-    "lqr": "LQR",
+BOUNDS: dict[str, Any] = {"hidden": (16, 16), "slope_min": FLOOR, "slope_max": CAP}
+METHODS: dict[str, tuple[str, type[PPO] | None, Callable[[], nn.Module]]] = {
+    "ppo": ("PPO", PPO, lambda: DirectPolicy(JointNetwork(2, inputs=4, seeds=SEEDS))),
+    "penalty": (
+        "PPO with a Jacobian penalty",
+        PenalisedPPO,
+        lambda: DirectPolicy(JointNetwork(2, inputs=4, seeds=SEEDS)),
+    ),
+    "cppo": ("C-PPO", PPO, lambda: ModularPolicy(PositiveNetwork(2, seeds=SEEDS, **BOUNDS))),
+    "convex": (
+        "convex-gradient PI",
+        PPO,
+        lambda: ModularPolicy(ConvexGradientNetwork(2, seeds=SEEDS)),
+    ),
+    "lqr": ("LQR", None, LQR),
 }
+"""Title, learner, and the policy of all seeds side by side."""
 
 
-def compare(updates: int = UPDATES) -> pd.DataFrame:
+def table(updates: int = UPDATES) -> pd.DataFrame:
     """A row for each method and seed."""
-    rows: list[tuple[Any, ...]] = []
-    for name, title in METHODS.items():
-        begin, policy = time.process_time(), LQR() if name == "lqr" else build(name)
-        seeds: tuple[int, ...] = SEEDS
-        if name == "lqr":
-            seeds = (0,)
-        else:
+    rows = []
+    for name, (title, learner, build) in METHODS.items():
+        begin, policy = time.process_time(), build()
+        seeds: tuple[int, ...] = (0,)
+        steps = 0
+        if learner is not None:
             env = PlantVectorEnv(EACH * len(SEEDS), PLANT, H, target=GOAL, horizon=STEPS, room=1.6)
-            learner = PenalisedPPO if name == "penalty" else PPO
             seen = AuxiliarySpaceVectorWrapper(env, SPACE)
             learner(seen, policy, SEEDS, PPOConfig(steps=STEPS)).train(updates)
+            seeds, steps = SEEDS, EACH * STEPS * updates
         spent = (time.process_time() - begin) / len(seeds)
+        about = {"method": name, "title": title, "test": "nominal", "last": True, "step": steps}
         for k in seeds:
             action = of_seed(policy, k)
-            rows.append((name, title, k, *trial(action, False), *trial(action, True)[1:]))
-            rows[-1] += (certified(action), spent)
-    names = ["method", "title", "seed", "return", "unstable", "off"]
-    more = ["unstable_shifted", "off_shifted", "certified_m", "cpu_s"]
-    return pd.DataFrame(rows, columns=names + more)
-
-
-if __name__ == "__main__":
-    table = compare()
-    target = store.asset("results").parent / "peers" / "own_plant.csv"
-    store.write_atomic(target, lambda file: file.write(table.round(4).to_csv(index=False).encode()))
-    print(table.round(3).to_string())
+            row: dict[str, Any] = about | {"seed": k}
+            row["return"], row["unstable"], row["off"] = trial(action, shifted=False)
+            _, row["unstable_shifted"], row["off_shifted"] = trial(action, shifted=True)
+            rows.append(row | {"certified_m": certified(action), "cpu_s": spent})
+    return pd.DataFrame(rows).round(4)

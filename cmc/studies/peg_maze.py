@@ -104,7 +104,7 @@ _STIFF = _TUNED.variant(
 _PAPER_SIZES = _TUNED.variant(
     "peg_maze_paper_sizes",
     "the maze with the network sizes of the paper's table, by the earlier scheme",
-    planner=replace(_TUNED.config.planner, critic_hidden=(400, 300)),
+    planner={"critic_hidden": (400, 300)},
     planner_hidden=(400, 300),
     low_hidden=(200, 200),
 )

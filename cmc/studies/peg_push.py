@@ -35,7 +35,6 @@ by c, while zeta, d and all else stay: k goes with 1 / c^2, b with 1 / c. Studie
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -47,13 +46,15 @@ from cmc.learning.hierarchy import HierarchyConfig
 from cmc.learning.ppo import PPOConfig
 from cmc.learning.td3 import TD3Config
 from cmc.studies.peg_maze import TESTS
-from cmc.studies.study import Study, Test, last
+from cmc.studies.study import Study, Test, changed, last
 from cmc.studies.two_level import TwoLevelConfig, light
 from cmc.studies.two_level_arms import METHODS
 from cmc.studies.two_level_tests import judge, motion
 
 TIME_CONSTANT = 0.01
 """Of contact in the scene, s."""
+CONTACT = ("ctd3", "frozen", "td3")
+"""Methods that are tested under other contact."""
 
 
 @cache
@@ -80,11 +81,6 @@ def scaled(scale: float) -> type[PegPush]:
 
     Scaled.__name__ = Scaled.__qualname__ = f"PegPush, contact x {scale:g}"
     return Scaled
-
-
-def contact(scale: float) -> Callable[[TwoLevelConfig], TwoLevelConfig]:
-    """The task with the time constant of all contact multiplied."""
-    return lambda config: replace(config, task_class=scaled(scale))
 
 
 STUDY = Study(
@@ -125,8 +121,8 @@ STUDY = Study(
     tests=(
         *TESTS,
         *(
-            Test(f"contact x {scale:g}", 50, contact(scale), last, ("ctd3", "frozen", "td3"))
-            for scale in (0.4, 0.7, 2.0, 4.0)
+            Test(f"contact x {c:g}", 50, changed(task_class=scaled(c)), last, CONTACT)
+            for c in (0.4, 0.7, 2.0, 4.0)
         ),
     ),
     length=600_000,
@@ -142,7 +138,7 @@ HALF = replace(
         "peg_push_half",
         "peg push by an earlier scheme: discount .5, and slopes that start at 20, set by hand",
         hierarchy=HierarchyConfig(high_noise_end=0.05),
-        planner=replace(STUDY.config.planner, discount=0.5, target_rate=0.005, pull=0.0),
+        planner={"discount": 0.5, "target_rate": 0.005, "pull": 0.0},
         ppo=PPOConfig(gamma=0.5, epochs=10, learning_rate=1e-3),
         relative=False,
         start_gain=20.0,

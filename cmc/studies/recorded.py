@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from cmc import store
+from cmc import store, studies
 
 _ARRAYS = ("t", "qpos", "tip", "force", "distance")
 _ENDS = ("success", "touched")
@@ -22,15 +22,10 @@ _MARKER = "marker "
 
 
 def save(path: str | Path, motion: Mapping[str, Any], record: Mapping[str, Any]) -> Path:
-    """Write a study's `motion` as a recording, atomically.
-
-    Args:
-        path: an npz file.
-        motion: what a study's `motion` returns.
-        record: JSON record with `study` and `method` (of the configuration that made the scene).
+    """Write what a study's `motion` returns as an npz file, atomically.
 
     Raises:
-        ValueError: if the record lacks `study` or `method`.
+        ValueError: if the record lacks `study` or `method`, which made the scene.
     """
     missing = {"study", "method"} - set(record)
     if missing:
@@ -46,17 +41,12 @@ def save(path: str | Path, motion: Mapping[str, Any], record: Mapping[str, Any])
 
 
 def load(path: str | Path) -> dict[str, Any]:
-    """Read a recording: what `motion` returned, with `model` made anew, and `record`.
-
-    Args:
-        path: the file, or the name of a shipped one.
+    """Read a file, or a shipped one by its name: `motion`, its `model` made anew, and `record`.
 
     Raises:
         FileNotFoundError: if no episode of this name is shipped.
         CheckpointError: if the file is damaged, foreign, or does not fit its scene.
     """
-    from cmc.studies import registry  # brings torch, which the file itself does not need
-
     path = Path(path)
     file = path if path.suffix else store.asset("episodes", f"{path}.npz")
     try:
@@ -64,10 +54,10 @@ def load(path: str | Path) -> dict[str, Any]:
             arrays = {name: found[name] for name in found.files}
         record = json.loads(str(arrays.pop("record")))
         motion: dict[str, Any] = {name: arrays.pop(name) for name in _ARRAYS}
-        model = registry.get(record["study"]).config_of(record["method"]).make(1).worlds.model
-    except FileNotFoundError:
-        raise
+        model = studies.get(record["study"]).config_of(record["method"]).make(1).worlds.model
     except (OSError, ValueError, KeyError, EOFError, AttributeError, zipfile.BadZipFile) as error:
+        if isinstance(error, FileNotFoundError):
+            raise
         raise store.CheckpointError(f"{file} is not a recorded episode: {error}") from error
     if motion["qpos"].shape != (len(motion["t"]), model.nq):
         raise store.CheckpointError(

@@ -8,11 +8,12 @@ there to the same end, bit for bit.
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, is_dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -55,7 +56,6 @@ def train(
         The checkpoint file with all kept policies, which `load` reads.
 
     Raises:
-        ValueError: for an unknown method, one without training, no seed or no length.
         CheckpointError: if the folder holds a run of other seeds or another configuration.
         KeyboardInterrupt: on SIGINT and SIGTERM, once everything is saved.
     """
@@ -112,10 +112,11 @@ def _resumed(
         return {}, []  # a state without its policies belongs to nothing: the run starts afresh
     kept, found = store.load_checkpoint(packed, study=record["study"], method=record["method"])
     advice = "use another folder (--out), or move it away"
-    for key, value in (("seeds", record["seeds"]), ("configuration", record["configuration"])):
-        if found.get(key) != value:
-            what = f"seeds {found.get(key)}, not {value}" if key == "seeds" else f"another {key}"
-            raise store.CheckpointError(f"{packed} is a run of {what}: {advice}")
+    if found.get("seeds") != record["seeds"]:
+        what = f"seeds {found.get('seeds')}, not {record['seeds']}"
+        raise store.CheckpointError(f"{packed} is a run of {what}: {advice}")
+    if found.get("configuration") != record["configuration"]:
+        raise store.CheckpointError(f"{packed} is a run of another configuration: {advice}")
     curve = [row for key in ("rewards", "returns") for row in kept.pop(key, ())]
     if not state.is_file():
         raise store.CheckpointError(
@@ -126,11 +127,10 @@ def _resumed(
 
 def _mark(study: Study, done: int, stride: int, total: int) -> int | None:
     """The step under which the present policy is kept, if it is."""
-    every, last = study.every, done >= total
-    if last and done % every >= stride:
+    whole = done // study.every * study.every
+    if done >= total and done - whole >= stride:
         return done
-    crossed = done // every > (done - stride) // every
-    return done // every * every if last or crossed else None
+    return whole if done >= total or whole > done - stride else None
 
 
 def _weights(training: Any, mark: int) -> dict[str, np.ndarray]:
@@ -143,43 +143,33 @@ def _weights(training: Any, mark: int) -> dict[str, np.ndarray]:
 
 
 def _record(study: Study, name: str, seeds: Sequence[int], total: int) -> dict[str, Any]:
+    """The record of a run; its configuration as JSON gives it back."""
     command = f"python -m cmc train {study.name} --method {name} --seeds {len(seeds)}"
     made = store.provenance(f"{command} --{study.unit}s {total}", [int(seed) for seed in seeds])
-    settings = {"every": study.every, **plain(study.config_of(name))}
+
+    def other(value: Any) -> Any:
+        return value.tolist() if isinstance(value, np.ndarray) else value.__name__
+
+    settings = {"every": study.every, **asdict(study.config_of(name))}
+    settings = json.loads(json.dumps(settings, default=other))
     return {"study": study.name, "method": name, "configuration": settings, **made}
-
-
-def plain(value: Any) -> Any:
-    """What JSON makes of a configuration: dataclasses become objects, arrays and tuples lists."""
-    if is_dataclass(value) and not isinstance(value, type):
-        value = asdict(value)
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, type) or callable(value):
-        return value.__name__
-    return [plain(item) for item in value] if isinstance(value, (tuple, list)) else value
 
 
 # -- what was learned -----------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Loaded:
+class Loaded(NamedTuple):
     """A kept policy of all seeds, or of one.
 
     Attributes:
         policy: as the study's tests take it, with a leading axis of seeds.
         mark: its step or episode; 0 for fixed gains.
         seeds: the trainings.
-        record: of the run.
     """
 
     policy: Any
     mark: int
     seeds: list[int]
-    record: dict[str, Any]
 
 
 def load(
@@ -198,19 +188,13 @@ def load(
         mark: step or episode of a kept policy; the last one if None.
         seed: position of one seed, for a leading axis of one; None for all seeds.
         path: checkpoint file; the shipped one if None.
-
-    Raises:
-        ValueError: for an unknown method, step or seed.
-        FileNotFoundError: if no file is given and none is shipped.
-        CheckpointError: if the file is damaged, foreign, or of another study or method.
     """
     light = replace(study, config=study.light(study.config))
     if not study.method(name).trained:
-        return Loaded(light.build(name, [0]).acting(), 0, [0], {})
+        return Loaded(light.build(name, [0]).acting(), 0, [0])
     file = find(study, name) if path is None else Path(path)
     tensors, record = store.load_checkpoint(file, study=study.name, method=name)
-    found = marks_of(tensors)
-    seeds = record.get("seeds")
+    found, seeds = marks_of(tensors), record.get("seeds")
     if not (found and isinstance(seeds, list) and seeds):
         raise store.CheckpointError(f"{file}: wanted kept policies and seeds, found none")
     mark = found[-1] if mark is None else mark
@@ -221,36 +205,22 @@ def load(
     chosen = seeds if seed is None else [seeds[seed]]
     training = light.build(name, chosen)
     for part, module in training.actors().items():
-        starts = (f"{mark:08d}.{part}.", f"{mark:06d}.")  # the second is an older form
-        state = {
-            key.removeprefix(start): torch.from_numpy(value)
-            for start in starts
-            for key, value in tensors.items()
-            if key.startswith(start)
-        }
-        _put(module, state, len(seeds), seed, file)
-    return Loaded(training.acting(), mark, chosen, record)
-
-
-def _put(module: Any, state: dict[str, Any], seeds: int, seed: int | None, file: Path) -> None:
-    """Give a network its weights; constants that the file lacks follow from the configuration."""
-    own, fitted = module.state_dict(), {}
-    for key, value in state.items() if own else ():
-        # older files say `net` for `network`, and leave the layers of a planner unnamed
-        names = (key, key.replace("net.", "network.", 1), key.replace("net.", "network.mlp.", 1))
-        name = next((name for name in names if name in own), None)
-        if name is None:
-            raise store.CheckpointError(f"{file}: wanted tensors {sorted(own)}, got {key!r}")
-        if seed is not None and value.numel() == seeds * own[name].numel():
-            value = value.reshape(seeds, *own[name].shape)[seed]
-        if value.shape != own[name].shape:
-            shapes = f"wanted {tuple(own[name].shape)}, got {tuple(value.shape)}"
-            raise store.CheckpointError(f"{file}: shape of {name}: {shapes}")
-        fitted[name] = value
-    if missing := {key for key, _ in module.named_parameters()} - set(fitted):
-        raise store.CheckpointError(f"{file}: lacks tensors {sorted(missing)}")
-    module.load_state_dict(fitted, strict=False)
-    module.eval()
+        start, own = f"{mark:08d}.{part}.", module.state_dict()
+        kept = {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}
+        if lacking := set(own) - set(kept):
+            raise store.CheckpointError(f"{file}: lacks tensors {sorted(lacking)} of {start}")
+        state = {}
+        for key, wanted in own.items():
+            value, shape = kept[key], tuple(wanted.shape)
+            if seed is not None and value.size == len(seeds) * wanted.numel():
+                value = value.reshape(len(seeds), *shape)[seed]
+            if value.shape != shape:
+                said = f"wanted {shape}, got {value.shape}"
+                raise store.CheckpointError(f"{file}: shape of {key}: {said}")
+            state[key] = torch.from_numpy(value)
+        module.load_state_dict(state)
+        module.eval()
+    return Loaded(training.acting(), mark, chosen)
 
 
 def marks_of(tensors: Mapping[str, Any]) -> list[int]:
@@ -259,11 +229,7 @@ def marks_of(tensors: Mapping[str, Any]) -> list[int]:
 
 
 def find(study: Study, name: str, checkpoints: Folder = None) -> Path:
-    """Checkpoint file of a method: in the folder, else the shipped one, else that of `runs`.
-
-    Raises:
-        ValueError: for an unknown method.
-    """
+    """Checkpoint file of a method: in the folder, else the shipped one, else that of `runs`."""
     study.method(name)
     file = f"{study.name}_{name}.safetensors"
     if checkpoints is not None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -13,38 +14,52 @@ from torch import nn
 
 Array = NDArray[np.float64]
 Rows = list[dict[str, Any]]
+Change = Callable[[Any], Any]
+"""A configuration to another one."""
 
 
 class Training(Protocol):
-    """A method's training of several seeds side by side."""
+    """A method's training of several seeds side by side.
+
+    `steps`: environment steps, or episodes, of each seed so far; `segment` adds `stride` and
+    answers the mean reward or return by seed. `actors` are the networks that act, by the name under
+    which their weights are kept; `acting` is what acts now, without exploration, as the study's
+    tests take it. `save` writes everything that decides what follows, `load` continues from it.
+    """
 
     @property
-    def steps(self) -> int:
-        """Environment steps, or episodes, of each seed so far."""
-
+    def steps(self) -> int: ...  # noqa: D102
     @property
-    def stride(self) -> int:
-        """How many `segment` adds."""
-
-    def segment(self) -> Array:
-        """Go on; mean reward or return by seed, (seeds,)."""
-
-    def actors(self) -> Mapping[str, nn.Module]:
-        """The networks that act, by the name under which their weights are kept."""
-
-    def acting(self) -> Any:
-        """What acts now, without exploration, as the study's tests take it."""
-
-    def save(self, path: str | Path, record: Mapping[str, Any]) -> None:
-        """Write everything that decides what follows."""
-
-    def load(self, path: str | Path, record: Mapping[str, Any]) -> None:
-        """Continue from `save`."""
+    def stride(self) -> int: ...  # noqa: D102
+    def segment(self) -> Array: ...  # noqa: D102
+    def actors(self) -> Mapping[str, nn.Module]: ...  # noqa: D102
+    def acting(self) -> Any: ...  # noqa: D102
+    def save(self, path: str | Path, record: Mapping[str, Any]) -> None: ...  # noqa: D102
+    def load(self, path: str | Path, record: Mapping[str, Any]) -> None: ...  # noqa: D102
 
 
 def same(config: Any) -> Any:
     """No change of a configuration."""
     return config
+
+
+def changed(**changes: Any) -> Change:
+    """With some fields changed; of a configuration among them, only the fields that are named."""
+
+    def adapt(config: Any) -> Any:
+        new: dict[str, Any] = {}
+        for name, value in changes.items():
+            old: Any = getattr(config, name)
+            partial = is_dataclass(old) and isinstance(value, Mapping)
+            new[name] = replace(old, **value) if partial else value
+        return replace(config, **new)
+
+    return adapt
+
+
+def both(*steps: Change) -> Change:
+    """One change after another."""
+    return lambda config: reduce(lambda changed, step: step(changed), steps, config)
 
 
 @dataclass(frozen=True)
@@ -60,7 +75,7 @@ class Method:
 
     title: str
     build: Callable[[Any, Sequence[int]], Training]
-    adapt: Callable[[Any], Any] = same
+    adapt: Change = same
     trained: bool = True
 
 
@@ -80,7 +95,7 @@ class Test:
 
     name: str
     number: int
-    change: Callable[[Any], Any] = same
+    change: Change = same
     when: Callable[[Sequence[int]], Iterable[int]] = same
     methods: tuple[str, ...] | None = None
 
@@ -126,22 +141,13 @@ class Study:
     every: int
     judge: Callable[[Any, Any, int, Test], dict[str, Rows]]
     motion: Callable[[Any, Any, int], dict[str, Any]]
-    light: Callable[[Any], Any] = same
+    light: Change = same
     shown: Callable[[Sequence[int]], Iterable[int]] = last
     unit: Literal["step", "episode"] = "step"
     gain: Literal["reward", "return"] = "reward"
 
-    def __post_init__(self) -> None:
-        for name in ("length", "every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: wanted at least 1, got {getattr(self, name)}")
-
     def method(self, name: str) -> Method:
-        """The method of this name.
-
-        Raises:
-            ValueError: if there is none.
-        """
+        """The method of this name; a ValueError names the others if there is none."""
         if name not in self.methods:
             raise ValueError(f"unknown method {name!r}; wanted one of {', '.join(self.methods)}")
         return self.methods[name]
@@ -151,15 +157,11 @@ class Study:
         return self.method(name).adapt(self.config)
 
     def build(self, name: str, seeds: Sequence[int]) -> Training:
-        """A method's training, not yet begun.
-
-        Raises:
-            ValueError: for an unknown method, or no seed.
-        """
+        """A method's training, not yet begun."""
         if len(seeds) == 0:
             raise ValueError("seeds: wanted at least one, got none")
         return self.method(name).build(self.config_of(name), seeds)
 
     def variant(self, name: str, about: str, **changes: Any) -> Study:
-        """This study under another name, with some fields of its configuration changed."""
-        return replace(self, name=name, about=about, config=replace(self.config, **changes))
+        """This study under another name, with its configuration `changed`."""
+        return replace(self, name=name, about=about, config=changed(**changes)(self.config))

@@ -11,18 +11,18 @@ use too, prefer loky.
 from __future__ import annotations
 
 import os
+import re
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Literal
 
-from cmc.store import alive
-from cmc.studies import registry, runner
-from cmc.studies.shipping import merge
+import numpy as np
 
-Backend = Literal["loky", "dask"]
+from cmc import store, studies
+from cmc.studies import runner
 
 
 def sweep(
@@ -32,88 +32,62 @@ def sweep(
     *,
     length: int | None = None,
     jobs: int = 1,
-    backend: Backend = "loky",
+    backend: Literal["loky", "dask"] = "loky",
     group: int | None = None,
     address: str | None = None,
     out: str | Path | None = None,
 ) -> list[Path]:
-    """Train several methods.
+    """Train several methods with the same seeds; the checkpoint file of each.
 
-    Args:
-        study: name of the study.
-        names: its methods.
-        seeds: one training for each.
-        length: steps or episodes of each seed, in place of the study's.
-        jobs: how many run at a time.
-        backend: "loky" runs processes of this machine, "dask" a cluster (extra `cmc[cluster]`).
-        group: seeds of one job; all seeds of a method if None, which costs least in all.
-        address: of a running Dask scheduler; a cluster of `jobs` processes is made if None.
-        out: folder, by default `runs/STUDY`.
-
-    Returns:
-        The checkpoint file of each method.
+    A job has `group` seeds of a method (all if None, which costs least in all); `jobs` run at a
+    time: by "loky" in processes of this machine, by "dask" (extra `cmc[cluster]`) at the `address`
+    of a scheduler or in a cluster of `jobs` processes made for it. `length` and `out` are those of
+    `runner.train`.
 
     Raises:
         ValueError: for an unknown study, method or backend, no seed, or less than one job.
     """
     for name in names:
-        registry.get(study).method(name)
+        studies.get(study).method(name)
     size = len(seeds) if group is None else group
     for what, number in (("seeds", len(seeds)), ("jobs", jobs), ("group", size)):
         if number < 1:
             raise ValueError(f"{what}: wanted at least 1, got {number}")
-    folder = Path(out) if out is not None else Path("runs") / study
-    parts = [list(seeds[k : k + size]) for k in range(0, len(seeds), size)]
-    whole = len(parts) == 1
-    wanted = [
-        (name, part, folder if whole else folder / "parts" / f"{name}_{part[0]}-{part[-1]}")
-        for name in names
-        for part in parts
-    ]
-    made = _run(study, wanted, length, min(jobs, len(wanted)), backend, address)
-    if whole:
-        return made
-    grouped = [made[k : k + len(parts)] for k in range(0, len(made), len(parts))]
-    return [merge(paths, folder / paths[0].name) for paths in grouped]
-
-
-def _run(
-    study: str,
-    wanted: list[tuple[str, list[int], Path]],
-    length: int | None,
-    jobs: int,
-    backend: str,
-    address: str | None,
-) -> list[Path]:
     if backend not in ("loky", "dask"):
         raise ValueError(f"backend: wanted 'loky' or 'dask', got {backend!r}")
     from joblib import Parallel, delayed, parallel_config
 
+    folder = Path(out) if out is not None else Path("runs") / study
+    parts = [list(seeds[k : k + size]) for k in range(0, len(seeds), size)]
     parent = None if address is not None else os.getpid()
-    calls = [
-        delayed(_train)(study, name, part, str(where), length, parent)
-        for name, part, where in wanted
-    ]
-    if backend == "loky":
-        return [Path(path) for path in Parallel(n_jobs=jobs, batch_size=1, verbose=5)(calls)]
-    with _cluster(jobs, address), parallel_config(backend="dask"):
-        return [Path(path) for path in Parallel(n_jobs=jobs, batch_size=1, verbose=5)(calls)]
+    calls = []
+    for name in names:
+        for part in parts:
+            own = folder / "parts" / f"{name}_{part[0]}-{part[-1]}" if len(parts) > 1 else folder
+            calls.append(delayed(_train)(study, name, part, str(own), length, parent))
+    jobs = min(jobs, len(calls))
+    cluster = _cluster(jobs, address) if backend == "dask" else nullcontext()
+    with cluster, parallel_config(backend=backend):
+        made = [Path(p) for p in Parallel(n_jobs=jobs, batch_size=1, verbose=5)(calls)]
+    if len(parts) == 1:
+        return made
+    grouped = [made[k : k + len(parts)] for k in range(0, len(made), len(parts))]
+    return [merge(paths, folder / paths[0].name) for paths in grouped]
 
 
 def _train(
     study: str, name: str, seeds: list[int], out: str, length: int | None, parent: int | None
 ) -> str:
     """One job; runs in a worker, which ends when the process that started the sweep does."""
+
+    def end_with_parent() -> None:  # what was saved last is where the run goes on
+        while parent is not None and store.alive(parent):
+            time.sleep(1.0)
+        os._exit(1)
+
     if parent is not None and parent != os.getpid():
-        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    return str(runner.train(registry.get(study), name, seeds, length=length, out=out))
-
-
-def _end_with(parent: int) -> None:
-    """End this process once the parent has; what was saved last is where the run goes on."""
-    while alive(parent):
-        time.sleep(1.0)
-    os._exit(1)
+        threading.Thread(target=end_with_parent, daemon=True).start()
+    return str(runner.train(studies.get(study), name, seeds, length=length, out=out))
 
 
 @contextmanager
@@ -134,3 +108,28 @@ def _cluster(jobs: int, address: str | None) -> Iterator[None]:
     ):
         cluster.scheduler.http_server.stop()  # no option leaves it out altogether
         yield
+
+
+def merge(paths: Sequence[Path], out: Path) -> Path:
+    """Put checkpoints of the same method and different seeds together.
+
+    Raises:
+        CheckpointError: if they are of different studies, methods, configurations or lengths.
+    """
+    loaded = [store.load_checkpoint(path) for path in paths]
+    tensors, record = loaded[0]
+    for path, (others, found) in zip(paths, loaded, strict=True):
+        for key in ("study", "method", "configuration"):
+            if found.get(key) != record.get(key):
+                raise store.CheckpointError(f"{path}: {key} differs from that of {paths[0]}")
+        if set(others) != set(tensors):
+            raise store.CheckpointError(f"{path}: other policies are kept than in {paths[0]}")
+    joined = {
+        # curves are (time, seeds); weights have the seeds first
+        key: np.concatenate([part[key] for part, _ in loaded], axis=int(not key[0].isdigit()))
+        for key in tensors
+    }
+    seeds = [seed for _, found in loaded for seed in found["seeds"]]
+    group = f"--seeds {len(seeds)} --group {len(record['seeds'])}"
+    command = re.sub(r"--seeds \d+", group, str(record.get("command", "")))
+    return store.save_checkpoint(out, joined, {**record, "seeds": seeds, "command": command})

@@ -2,41 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, is_dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from cmc.envs.panda_config import PandaTaskConfig
 from cmc.envs.panda_task import HIGH_LEVEL, PandaTask
+from cmc.envs.worlds import PandaTaskConfig
 from cmc.learning.hierarchy import HierarchyConfig
 from cmc.learning.latent import LatentConfig, LatentModel
 from cmc.learning.planning import Planning
 from cmc.learning.ppo import PPOConfig
 from cmc.learning.td3 import TD3Config
 from cmc.robot.panda import FINGERTIP, inverse_kinematics
+from cmc.studies.study import Array
 
-Array = NDArray[np.float64]
 HIRO_HALF = 0.1
 """Half-range of HIRO's joint increments, rad (appendix G)."""
 
 
 @dataclass(frozen=True)
 class TwoLevelConfig:
-    """Everything a run depends on.
+    """Everything a run depends on; what is not of the paper's tables is our choice.
 
     Attributes:
-        task: the environment.
-        task_class: its class.
-        shift, scale: normalization of the planner's observation, by field (our choice).
+        task, task_class: the environment.
+        shift, scale: normalization of what the planner sees, by field.
         hierarchy: rates and sizes.
-        planner: TD3 of the planner.
-        low: TD3 of a low level that learns from a critic.
+        planner, low: TD3 of the planner, and of a low level that learns from a critic.
         latent: learning through the latent model.
-        planner_hidden: hidden sizes (our choice; the paper's are 400, 300).
-        low_hidden: hidden sizes for each dimension (our choice; the paper's are 200, 200).
+        planner_hidden: hidden sizes (the paper's are 400, 300).
+        low_hidden: hidden sizes for each dimension (the paper's are 200, 200).
         start_gain: slope du/dy at rest that every low level with a network starts from.
         relative: whether the planner's critics also see tip and sub-goal relative to the goal.
         cap: what (K_d + g K2) dt is kept below by construction; chatter starts at 2. Learning
@@ -46,9 +43,8 @@ class TwoLevelConfig:
         fields: what the planner sees; the task's own if None.
         joint_task: the task in joint space, for HIRO.
         joint_aim: tip position that HIRO's random sub-goals of the warm-up lie around, m.
-        joint_hidden: hidden sizes of HIRO's low level (our choice).
-        joint_stride: ticks between those whose likelihood counts in relabelling (our choice).
-        joint_noise: exploration of HIRO's low level, in half-ranges.
+        joint_hidden, joint_noise: hidden sizes of HIRO's low level, its exploration, half-ranges.
+        joint_stride: ticks between those whose likelihood counts in relabelling.
     """
 
     task: PandaTaskConfig
@@ -81,20 +77,15 @@ class TwoLevelConfig:
 
     def planning(self) -> Planning:
         """Normalization of the planner's observations and sub-goals."""
-        return Planning(
-            {name: np.asarray(value, dtype=float) for name, value in self.shift.items()},
-            {name: np.asarray(value, dtype=float) for name, value in self.scale.items()},
-            np.array(self.task.subgoal_low),
-            np.array(self.task.subgoal_high),
-            self.fields,
-            self._joint_aim(),
+        shift, scale = (
+            {name: np.asarray(value, dtype=float) for name, value in part.items()}
+            for part in (self.shift, self.scale)
         )
-
-    def _joint_aim(self) -> Array | None:
-        if self.task.command != "joint" or self.joint_aim is None:
-            return None
-        tool = FINGERTIP + self.task.peg.length
-        return inverse_kinematics(self.joint_aim, tool=tool, q0=start_joints(self.task))
+        low, high, aim = np.array(self.task.subgoal_low), np.array(self.task.subgoal_high), None
+        if self.task.command == "joint" and self.joint_aim is not None:
+            tool = FINGERTIP + self.task.peg.length
+            aim = inverse_kinematics(self.joint_aim, tool=tool, q0=start_joints(self.task))
+        return Planning(shift, scale, low, high, self.fields, aim)
 
     def slope_cap(self) -> Array:
         """Largest slope d pi / dy that keeps (K_d + g K2) dt below the cap, (6,)."""
@@ -104,23 +95,14 @@ class TwoLevelConfig:
 
     def latent_model(self) -> LatentModel:
         """The model of the tip's latent signals that a low level may learn through."""
-        latent = self.task.gains.latent
-        return LatentModel(
-            latent.K_p,
-            latent.K_d,
-            latent.K1,
-            latent.K2,
-            np.array(self.task.u_limit),
-            np.array([*self.mass, 0.0, 0.0, 0.0]),
-            np.repeat([1.0, 0.0], 3),
-            self.task.tick,
-        )
+        k, limit = self.task.gains.latent, np.array(self.task.u_limit)
+        mass, translation = np.array([*self.mass, 0.0, 0.0, 0.0]), np.repeat([1.0, 0.0], 3)
+        return LatentModel(k.K_p, k.K_d, k.K1, k.K2, limit, mass, translation, self.task.tick)
 
     def critic_scale(self) -> Array:
         """Brings (y, int y, error, velocity, time left) of a 5 mm, .1 rad sub-goal to order one."""
-        latent = self.task.gains.latent
         size = np.repeat([0.005, 0.1], 3)
-        y = 1.0 / (latent.K1 * size)
+        y = 1.0 / (self.task.gains.latent.K1 * size)
         return np.concatenate([y, y / 0.4, 1.0 / size, 0.2 / size, [2.5]])
 
 
@@ -130,33 +112,6 @@ def start_joints(task: PandaTaskConfig) -> Array:
 
 
 # -- what a method changes of the configuration ---------------------------------------------------
-
-Adapt = Callable[[TwoLevelConfig], TwoLevelConfig]
-
-
-def changed(**changes: Any) -> Adapt:
-    """With some fields changed; of a configuration among them, only the fields that are named."""
-
-    def adapt(config: TwoLevelConfig) -> TwoLevelConfig:
-        new: dict[str, Any] = {}
-        for name, value in changes.items():
-            old = getattr(config, name)
-            partial = is_dataclass(old) and isinstance(value, Mapping)
-            new[name] = replace(old, **value) if partial else value  # type: ignore[type-var, arg-type]
-        return replace(config, **new)
-
-    return adapt
-
-
-def both(*steps: Adapt) -> Adapt:
-    """One change after another."""
-
-    def adapt(config: TwoLevelConfig) -> TwoLevelConfig:
-        for step in steps:
-            config = step(config)
-        return config
-
-    return adapt
 
 
 def in_joints(config: TwoLevelConfig) -> TwoLevelConfig:

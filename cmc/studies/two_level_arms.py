@@ -8,17 +8,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
 from cmc.envs.panda_task import PandaTask
 from cmc.learning.hierarchy import TwoLevel
 from cmc.learning.hiro import JointLow, JointUnits, Normalised, OffPolicyCorrection, PullActor
 from cmc.learning.latent import LatentLow
-from cmc.learning.low_level import CriticLow, Fixed, LowLevel, latent_policy, set_gain
-from cmc.learning.one_level import OneLevelPPO, SegmentEnv
-from cmc.learning.planning import CriticView, Planning
-from cmc.learning.td3 import TD3, View
+from cmc.learning.low_level import CriticLow, LowLevel, latent_policy, set_gain
+from cmc.learning.planning import CriticView, OneLevelPPO, Planning, SegmentEnv
+from cmc.learning.td3 import TD3
 from cmc.policies import (
     DirectPolicy,
     IndependentNetwork,
@@ -28,11 +26,11 @@ from cmc.policies import (
     PositiveNetwork,
 )
 from cmc.robot.panda import LOWER, UPPER
-from cmc.studies.study import Method
-from cmc.studies.two_level import Adapt, TwoLevelConfig, both, changed, in_joints, start_joints
+from cmc.studies.study import Array, Change, Method, both, changed
+from cmc.studies.two_level import TwoLevelConfig, in_joints, start_joints
 
-Array = NDArray[np.float64]
 Seeds = Sequence[int]
+Builder = Callable[[TwoLevelConfig, Seeds], LowLevel]
 Policy = tuple[nn.Module, LowLevel]
 """What is tested: the planner and a low level that neither explores nor learns."""
 N = 6  # dimensions of a pose
@@ -44,44 +42,24 @@ ACTOR_SIZE, CRITIC_SIZE = 2 * N, 4 * N + 1  # (y, int y), and with error, veloci
 
 def none(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
     """No action."""
-    return Fixed(None, N)
+    return LowLevel(None, N)
 
 
 def gain(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
     """A slope set by hand, for y and its integral alike."""
     start = _start(config)
-    return Fixed(latent_policy(LinearNetwork(np.stack([start, start], -1))), N)
+    return LowLevel(latent_policy(LinearNetwork(np.stack([start, start], -1))), N)
 
 
 def frozen(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
     """A capped network that stays as it started."""
-    return Fixed(capped_actor(config, seeds), N)
+    return LowLevel(capped_actor(config, seeds), N)
 
 
 def latent(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
     """A capped network that learns through the latent model."""
     actor, horizon = capped_actor(config, seeds), config.task.horizon
     return LatentLow(actor, seeds, config.latent_model(), horizon, config.latent)
-
-
-def paper(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
-    """Positive weights and biases; the critic sees (y, int y) and learns one-step targets."""
-    return _plain(config, seeds, PositiveNetwork(N, hidden=config.low_hidden, seeds=seeds))
-
-
-def positive(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
-    """Positive weights and biases; the critic sees the full state and learns returns."""
-    return _corrected(config, seeds, PositiveNetwork(N, hidden=config.low_hidden, seeds=seeds))
-
-
-def free(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
-    """Weights of any sign; else as `paper`."""
-    return _plain(config, seeds, IndependentNetwork(N, hidden=config.low_hidden, seeds=seeds))
-
-
-def corrected(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
-    """Weights of any sign; else as `positive`."""
-    return _corrected(config, seeds, IndependentNetwork(N, hidden=config.low_hidden, seeds=seeds))
 
 
 def _start(config: TwoLevelConfig) -> Array:
@@ -96,25 +74,29 @@ def capped_actor(config: TwoLevelConfig, seeds: Seeds) -> ModularPolicy:
     return latent_policy(net)
 
 
-def _plain(config: TwoLevelConfig, seeds: Seeds, net: Any) -> LowLevel:
-    set_gain(net, _start(config))
-    agent = TD3(latent_policy(net), seeds, ACTOR_SIZE, N, config.low, stream=2)
-    weights = {"translation": 1.0, "rotation": 1.0}
-    return CriticLow(agent, seeds, ACTOR_SIZE, noise=0.1, whole_return=False, weights=weights)
+def critic(network: Callable[..., Any], corrected: bool = False) -> Builder:
+    """A network with biases that learns from a critic.
 
+    The paper's critic, as we read it, sees (y, integral of y) and learns one-step targets from
+    meters and radians. A corrected one sees the full state and learns returns, in centimeters.
+    """
+    noise, size = (0.5, CRITIC_SIZE) if corrected else (0.1, ACTOR_SIZE)
+    weights = {"translation": 100.0 if corrected else 1.0, "rotation": 1.0}
 
-def _corrected(config: TwoLevelConfig, seeds: Seeds, net: Any) -> LowLevel:
-    set_gain(net, _start(config))
-    view = scaled(config.critic_scale())
-    agent = TD3(latent_policy(net), seeds, CRITIC_SIZE, N, config.low, stream=2, view=view)
-    weights = {"translation": 100.0, "rotation": 1.0}
-    return CriticLow(agent, seeds, CRITIC_SIZE, noise=0.5, whole_return=True, weights=weights)
+    def build(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
+        net = network(N, hidden=config.low_hidden, seeds=seeds)
+        set_gain(net, _start(config))
+        factor = torch.as_tensor(config.critic_scale(), dtype=torch.float32)
 
+        def view(observation: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+            return torch.cat([observation * factor, action], dim=-1)
 
-def scaled(scale: Array) -> View:
-    """What critics see: (observation * scale, action)."""
-    factor = torch.as_tensor(scale, dtype=torch.float32)
-    return lambda observation, action: torch.cat([observation * factor, action], dim=-1)
+        seen = view if corrected else None
+        agent = TD3(latent_policy(net), seeds, size, N, config.low, stream=2, view=seen)
+        options: Any = {"noise": noise, "whole_return": corrected, "weights": weights}
+        return CriticLow(agent, seeds, size, **options)
+
+    return build
 
 
 def joints(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
@@ -148,21 +130,18 @@ class OneLevelTraining(OneLevelPPO):
 
 
 def two_level(
-    low_level: Callable[[TwoLevelConfig, Seeds], LowLevel], relabel: bool = False
+    low_level: Builder, relabel: bool = False
 ) -> Callable[[TwoLevelConfig, Seeds], TwoLevelTraining]:
     """A planner that learns by TD3 over a low level; relabelled sub-goals are HIRO's."""
 
     def build(config: TwoLevelConfig, seeds: Seeds) -> TwoLevelTraining:
-        task = config.make(len(seeds) * config.hierarchy.worlds)
-        planning = config.planning()
-        actor, inputs = _planner(config, task, planning, seeds)
+        task, planning, actor, inputs = _planner(config, seeds)
         view = CriticView(task, planning) if config.relative else None
         agent = TD3(actor, seeds, inputs, len(planning.low), config.planner, stream=1, view=view)
         low: Any = low_level(config, seeds)
-        correction = None
+        horizon, correction = config.task.horizon, None
         if relabel:
-            stride = min(config.joint_stride, config.task.horizon)
-            correction = OffPolicyCorrection(low, seeds, config.task.horizon, stride)
+            correction = OffPolicyCorrection(low, seeds, horizon, min(config.joint_stride, horizon))
         return TwoLevelTraining(task, seeds, agent, low, planning, config.hierarchy, correction)
 
     return build
@@ -170,92 +149,72 @@ def two_level(
 
 def one_level(config: TwoLevelConfig, seeds: Seeds) -> OneLevelTraining:
     """A planner that learns by PPO, without a low level."""
-    task = config.make(len(seeds) * config.hierarchy.worlds)
-    planning = config.planning()
-    actor, _ = _planner(config, task, planning, seeds)
+    task, planning, actor, _ = _planner(config, seeds)
     env = SegmentEnv(task, planning, config.hierarchy.reward_scale)
     whole = replace(config.ppo, steps=config.task.ticks // config.task.horizon)
     return OneLevelTraining(env, actor, seeds, whole)
 
 
-def _planner(
-    config: TwoLevelConfig, task: PandaTask, planning: Planning, seeds: Seeds
-) -> tuple[DirectPolicy, int]:
-    """The planner's network, and the size of what it sees."""
-    size = planning.observe(task, task.reset()).shape[-1]
-    return planner(size, len(planning.low), config.planner_hidden, seeds), size
+def _planner(config: TwoLevelConfig, seeds: Seeds) -> tuple[PandaTask, Planning, DirectPolicy, int]:
+    """Task, normalization, the planner's network (to [-1, 1]), and the size of what it sees."""
+    task, planning = config.make(len(seeds) * config.hierarchy.worlds), config.planning()
+    inputs, hidden = planning.observe(task, task.reset()).shape[-1], config.planner_hidden
+    network = JointNetwork(len(planning.low), inputs=inputs, hidden=hidden, seeds=seeds, last=1.0)
+    return task, planning, DirectPolicy(network, squash=True), inputs
 
 
-def planner(inputs: int, outputs: int, hidden: Sequence[int], seeds: Seeds) -> DirectPolicy:
-    """Sub-goals in [-1, 1] from normalized observations."""
-    network = JointNetwork(outputs, inputs=inputs, hidden=hidden, seeds=seeds, last=1.0)
-    return DirectPolicy(network, squash=True)
-
-
-def still(low: LowLevel) -> Fixed:
+def still(low: LowLevel) -> LowLevel:
     """A low level as it is now, without exploration and learning."""
     if isinstance(low, JointLow):
-        return Fixed(Normalised(low.agent.actor, low.units), len(low.units.start))
-    return Fixed(low.agent.actor if isinstance(low, CriticLow) else getattr(low, "actor", None))
+        return LowLevel(Normalised(low.agent.actor, low.units), len(low.units.start))
+    return LowLevel(low.actor)
 
 
 # -- methods --------------------------------------------------------------------------------------
+
+
+def arm(title: str, low_level: Builder, *steps: Change, relabel: bool = False) -> Method:
+    """A method whose planner learns by TD3, and what it changes of the configuration."""
+    return Method(title, two_level(low_level, relabel), both(*steps))
+
 
 RESTING = changed(hierarchy={"low_updates": 0})
 """The low level does not learn."""
 TUNED = changed(start_gain=20.0)
 """A gain found by hand, close to the cap: what learning should find by itself."""
+GAUSSIAN = changed(hierarchy={"redraw": (0.0, 0.0), "burst": (0.0, 0.0)})
 
 
-def through_the_model(config: TwoLevelConfig) -> TwoLevelConfig:
+def model(config: TwoLevelConfig) -> TwoLevelConfig:
     """Learning through the latent model has updates and a cap of its own."""
     updates = changed(hierarchy={"low_updates": 16, "low_updates_late": 1, "low_late": 20_000})
     return replace(updates(config), cap=config.latent.cap)
 
 
-def hiro(high_noise: float, low_noise: float) -> Adapt:
-    """HIRO with this noise of the planner and of the low level, in half-ranges."""
-    noise = {"high_noise": high_noise, "high_noise_end": None}
-    return both(in_joints, changed(hierarchy=noise, joint_noise=low_noise))
+def noise(high: float, low: float) -> Change:
+    """HIRO's noise of the planner and of the low level, in half-ranges."""
+    return changed(hierarchy={"high_noise": high, "high_noise_end": None}, joint_noise=low)
 
 
 METHODS: dict[str, Method] = {
-    "ctd3": Method("TD3/C-TD3", two_level(latent), through_the_model),
-    "ctd3_tuned": Method(
-        "TD3/C-TD3, tuned start", two_level(latent), both(through_the_model, TUNED)
-    ),
-    "ctd3_short": Method(
-        "TD3/C-TD3, discount .5",
-        two_level(latent),
-        both(through_the_model, changed(planner={"discount": 0.5})),
-    ),
-    "ctd3_plain_view": Method(
-        "TD3/C-TD3, plain view", two_level(latent), both(through_the_model, changed(relative=False))
-    ),
-    "ctd3_no_bursts": Method(
-        "TD3/C-TD3, Gaussian noise alone",
-        two_level(latent),
-        both(through_the_model, changed(hierarchy={"redraw": (0.0, 0.0), "burst": (0.0, 0.0)})),
-    ),
-    "ctd3_no_pull": Method(
-        "TD3/C-TD3, no pull",
-        two_level(latent),
-        both(through_the_model, changed(planner={"pull": 0.0})),
-    ),
-    "ctd3_paper": Method("TD3/C-TD3, the paper's scheme", two_level(paper)),
-    "ctd3_positive": Method("TD3/C-TD3, corrected critic", two_level(positive)),
-    "frozen": Method("TD3/frozen random C", two_level(frozen), RESTING),
-    "frozen_tuned": Method(
-        "TD3/frozen random C, tuned start", two_level(frozen), both(RESTING, TUNED)
-    ),
-    "gain": Method("TD3/hand-tuned gain", two_level(gain), both(RESTING, TUNED)),
-    "td3": Method("TD3/TD3, plain critic", two_level(free)),
-    "td3_corrected": Method("TD3/TD3, corrected critic", two_level(corrected)),
-    "control": Method("TD3/Control", two_level(none), RESTING),
+    "ctd3": arm("TD3/C-TD3", latent, model),
+    "ctd3_tuned": arm("TD3/C-TD3, tuned start", latent, model, TUNED),
+    "ctd3_short": arm("TD3/C-TD3, discount .5", latent, model, changed(planner={"discount": 0.5})),
+    "ctd3_plain_view": arm("TD3/C-TD3, plain view", latent, model, changed(relative=False)),
+    "ctd3_no_bursts": arm("TD3/C-TD3, Gaussian noise alone", latent, model, GAUSSIAN),
+    "ctd3_no_pull": arm("TD3/C-TD3, no pull", latent, model, changed(planner={"pull": 0.0})),
+    "ctd3_paper": arm("TD3/C-TD3, the paper's scheme", critic(PositiveNetwork)),
+    "ctd3_positive": arm("TD3/C-TD3, corrected critic", critic(PositiveNetwork, corrected=True)),
+    "frozen": arm("TD3/frozen random C", frozen, RESTING),
+    "frozen_tuned": arm("TD3/frozen random C, tuned start", frozen, RESTING, TUNED),
+    "gain": arm("TD3/hand-tuned gain", gain, RESTING, TUNED),
+    "td3": arm("TD3/TD3, plain critic", critic(IndependentNetwork)),
+    "td3_corrected": arm("TD3/TD3, corrected critic", critic(IndependentNetwork, corrected=True)),
+    "control": arm("TD3/Control", none, RESTING),
     "ppo_control": Method("PPO/Control", one_level),
 }
 HIRO: dict[str, Method] = {
-    "hiro": Method("HIRO", two_level(joints, relabel=True), hiro(1.0, 1.0)),
-    "hiro_matched": Method("HIRO, matched noise", two_level(joints, relabel=True), hiro(0.3, 0.1)),
+    "hiro": arm("HIRO", joints, in_joints, noise(1.0, 1.0), relabel=True),
+    "hiro_matched": arm("HIRO, matched noise", joints, in_joints, noise(0.3, 0.1), relabel=True),
 }
 """Where the study has a task in joint space."""
