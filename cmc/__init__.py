@@ -16,7 +16,6 @@ _SUBMODULES = (
     "exercises",
     "fast",
     "learning",
-    "lessons",
     "notation",
     "plants",
     "policies",

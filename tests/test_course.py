@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+TEXT = {"capture_output": True, "text": True, "check": False}
 
 
 def free_port() -> int:
@@ -38,13 +39,10 @@ def test_the_lab_serves_the_first_notebook_on_loopback_with_a_token(tmp_path: Pa
         "HOME": str(tmp_path),
         "JUPYTER_CONFIG_PATH": str(ROOT / "assets" / "jupyter"),
     }
-    server = subprocess.Popen(
-        [sys.executable, "-m", "jupyterlab", "--no-browser", "--port", str(port)],
-        env=environment,
-        cwd=tmp_path,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
+    command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--port", str(port)]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    where = {"env": environment, "cwd": tmp_path}
+    server = subprocess.Popen(command, **where, **quiet)
     try:
         url = f"http://127.0.0.1:{port}/api/contents/00_start_here.ipynb?content=0"
         wait_for(f"http://127.0.0.1:{port}/api", server)
@@ -54,15 +52,7 @@ def test_the_lab_serves_the_first_notebook_on_loopback_with_a_token(tmp_path: Pa
             assert "00_start_here.ipynb" in answer.read().decode()
         with socket.socket() as probe:  # a server on all interfaces would answer here
             assert probe.connect_ex(("127.0.0.2", port)) != 0
-        again = subprocess.run(
-            [sys.executable, "-m", "jupyterlab", "--no-browser", "--port", str(port)],
-            env=environment,
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
+        again = subprocess.run(command, **where, **TEXT, timeout=60)
         assert again.returncode != 0
         assert f"port {port} is not available" in again.stderr
     finally:
@@ -75,13 +65,11 @@ def wait_for(url: str, server: subprocess.Popen, seconds: float = 60.0) -> None:
     while time.monotonic() < end:
         assert server.poll() is None, "the server ended by itself"
         try:
-            urllib.request.urlopen(url, timeout=5).close()
+            return urllib.request.urlopen(url, timeout=5).close()
         except urllib.error.HTTPError:
             return
         except OSError:
             time.sleep(0.3)
-        else:
-            return
     raise AssertionError(f"nothing answered at {url} within {seconds} s")
 
 
@@ -100,13 +88,8 @@ def fake_python(folder: Path, script: str) -> Path:
 
 
 def make_course(folder: Path, python: str) -> list[str]:
-    run = subprocess.run(
-        ["make", "--no-print-directory", "course", f"PYTHON={python}"],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = ["make", "--no-print-directory", "course", f"PYTHON={python}"]
+    run = subprocess.run(command, cwd=folder, **TEXT)
     assert run.returncode != 0
     assert not (folder / ".venv" / ".made").exists()
     return run.stdout.splitlines()

@@ -1,4 +1,4 @@
-"""Two levels: the planner's exploration, its rates, and what its critics see."""
+"""Planners: exploration, rates, what critics see; and PPO without a low level."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 import torch
 
+from cmc.envs.peg_maze import PegMaze
 from cmc.learning.hierarchy import HierarchyConfig, play
+from cmc.learning.planning import SegmentEnv
 from cmc.studies import peg_maze, peg_push
 from cmc.studies.two_level_arms import frozen, latent, two_level
 
 MAZE, PUSH = peg_maze.STUDY.config, peg_push.STUDY.config
 
 
-def test_exploration_falls_linearly_and_stays():
+def test_schedules_fall_linearly_and_stay():
     config = HierarchyConfig(
         high_noise=0.4, high_noise_end=0.1, redraw=(0.2, 0.1), burst=(0.1, 0.0), noise_steps=1000
     )
@@ -23,22 +25,16 @@ def test_exploration_falls_linearly_and_stays():
     np.testing.assert_allclose(np.diff(found[:11], axis=0) - [-0.03, -0.01, -0.01], 0, atol=1e-12)
     np.testing.assert_allclose(found[10:] - [0.1, 0.1, 0.0], 0, atol=1e-12)
     assert HierarchyConfig(high_noise=0.4).exploration(10**6) == (0.4, 0.0, 0.0)
-
-
-def test_rates_fall_to_a_tenth_between_two_steps():
-    config = HierarchyConfig(rate_steps=(100, 300))
-    assert [config.rate(k) for k in (0, 100, 200, 300, 400)] == pytest.approx(
-        [1, 1, 0.55, 0.1, 0.1]
-    )
+    rates = [HierarchyConfig(rate_steps=(100, 300)).rate(k) for k in (0, 100, 200, 300, 400)]
+    assert rates == pytest.approx([1, 1, 0.55, 0.1, 0.1])
 
 
 def test_the_low_level_learns_from_the_start_and_the_planner_after_the_warm_up():
     config = HierarchyConfig(
         samples=10, high_updates=5, low_updates=4, low_updates_late=1, low_late=200, warm_up=100
     )
-    assert config.updates(100) == (0, 40)
-    assert config.updates(200) == (50, 80)
-    assert config.updates(300) == (100, 90)
+    found = [config.updates(steps) for steps in (100, 200, 300)]
+    assert found == [(0, 40), (50, 80), (100, 90)]
 
 
 def planner(config, worlds=400):
@@ -60,13 +56,8 @@ def test_sub_goals_scatter_by_the_noise_of_the_moment(steps):
 
 
 def test_redraws_and_bursts_come_as_often_as_asked_and_bursts_last():
-    rates = replace(
-        PUSH.hierarchy,
-        high_noise=0.0,
-        high_noise_end=0.0,
-        redraw=(0.1, 0.1),
-        burst=(0.05, 0.05),
-    )
+    calm = {"high_noise": 0.0, "high_noise_end": 0.0}
+    rates = replace(PUSH.hierarchy, **calm, redraw=(0.1, 0.1), burst=(0.05, 0.05))
     trainer, seen = planner(replace(PUSH, hierarchy=rates))
     trainer.steps = 10_000
     drawn = np.array([trainer._choose(seen, np.zeros(()))[0] != 0 for _ in range(60)])
@@ -129,3 +120,43 @@ def test_play_keeps_what_a_loop_by_hand_sees():
 def test_impossible_settings_are_refused(wrong):
     with pytest.raises(ValueError, match="noise|redraw|rate_steps"):
         HierarchyConfig(**wrong)
+
+
+# ---- PPO as a planner without a low level
+
+
+def env_of(worlds: int) -> SegmentEnv:
+    task = PegMaze(replace(MAZE.task, ticks=60), num=worlds)
+    return SegmentEnv(task, MAZE.planning(), reward_scale=100.0)
+
+
+def test_a_step_is_a_segment_of_ticks_without_action() -> None:
+    env, alone = env_of(2), PegMaze(replace(MAZE.task, ticks=60), num=2)
+    alone.seed(9)
+    first, _ = env.reset(seed=9)
+    obs = alone.reset()
+    np.testing.assert_allclose(first, MAZE.planning().observe(alone, obs), atol=1e-5)
+    action = np.random.default_rng(0).uniform(-1.5, 1.5, (3, 2, 3)).astype(np.float32)
+    for k in range(3):
+        seen, reward, ended, limit, _ = env.step(action[k])
+        low, high = np.array(MAZE.task.subgoal_low), np.array(MAZE.task.subgoal_high)
+        middle, half = (low + high) / 2, (high - low) / 2
+        obs = alone.set_subgoal(middle + half * np.clip(action[k], -1, 1))
+        total = np.zeros(2)
+        for _ in range(20):
+            obs, gain, *_ = alone.step(np.zeros((2, 6)))
+            total += gain
+        np.testing.assert_allclose(reward, 100.0 * total / 20, rtol=1e-9)
+        np.testing.assert_allclose(seen, MAZE.planning().observe(alone, obs), atol=1e-5)
+        assert not ended.any()
+        assert limit.all() == (k == 2)
+
+
+def test_every_seed_has_its_own_starts() -> None:
+    env = env_of(4)
+    both, _ = env.reset(seed=[3, 8])
+    again, _ = env.reset(seed=[8, 3])
+    np.testing.assert_array_equal(both[:2], again[2:])
+    assert not np.allclose(both[:2], both[2:])
+    with pytest.raises(ValueError, match="divide 4 worlds"):
+        env.reset(seed=[1, 2, 3])

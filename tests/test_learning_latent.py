@@ -89,7 +89,7 @@ def trained(config, updates: int, **options) -> LatentLow:
     rng = np.random.default_rng(0)
     observation = np.zeros((1, 1, 512, 25))
     observation[0, ..., 12:18] = rng.uniform(-1, 1, (512, 6)) * np.repeat([0.005, 0.3], 3)
-    low.record(Segment(observation, None, None, None))
+    low.record(Segment(observation, None, None))
     for _ in range(updates):
         low.update()
     return low

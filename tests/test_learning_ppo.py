@@ -20,12 +20,13 @@ from cmc.envs.peg_touch import PegTouchVectorEnv
 from cmc.learning.ppo import (
     PPO,
     PPOConfig,
+    Rollout,
     clip_gradients,
+    collect,
     generalised_advantage,
     shuffle,
     surrogate_gradient,
 )
-from cmc.learning.rollout import Rollout, collect
 from cmc.policies import (
     DirectPolicy,
     IndependentNetwork,
@@ -150,17 +151,17 @@ def test_report():
 
 def test_resumed_training_is_exactly_the_uninterrupted_one(tmp_path):
     path = tmp_path / "training.safetensors"
-    whole = training()
+    whole, first, resumed = training(), training(), training()
     whole.train(5)
-    training().train(3, checkpoint=path, every=2, record=RECORD)
-    resumed = training()
-    resumed.train(5, checkpoint=path, every=2, record=RECORD)
+    first.train(3)
+    first.save(path, RECORD)
+    resumed.load(path, RECORD)
+    resumed.train(5)
     assert same(whole.state()[0], resumed.state()[0])
     assert not same(whole.state()[0], training().state()[0])
 
 
-def test_interrupt_returns_to_the_last_whole_update(tmp_path, monkeypatch):
-    path = tmp_path / "training.safetensors"
+def test_interrupt_returns_to_the_last_whole_update(monkeypatch):
     whole, stopped = training(), training()
     whole.train(4)
     ordinary, calls = stopped._minibatch, []
@@ -173,19 +174,19 @@ def test_interrupt_returns_to_the_last_whole_update(tmp_path, monkeypatch):
 
     monkeypatch.setattr(stopped, "_minibatch", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        stopped.train(4, checkpoint=path, record=RECORD)
+        stopped.train(4)
     assert stopped.updates == 2
     stopped.train(4)
     assert same(whole.state()[0], stopped.state()[0])
-    resumed = training()
-    resumed.load(path, RECORD)
-    assert resumed.updates == 2
 
 
 SCRIPT = """
 import sys
 from tests.test_learning_ppo import RECORD, training
-training().train(10**6, checkpoint=sys.argv[1], every=3, record=RECORD)
+ppo = training()
+while True:
+    ppo.train(ppo.updates + 3)
+    ppo.save(sys.argv[1], RECORD)
 """
 
 
@@ -229,7 +230,7 @@ def test_foreign_checkpoints_are_refused(tmp_path):
         training().load(path, RECORD)
     path.write_bytes(path.read_bytes()[:-4])
     with pytest.raises(store.CheckpointError, match="not a complete"):
-        training().train(2, checkpoint=path, record=RECORD)
+        training().load(path, RECORD)
 
 
 def test_a_general_vector_environment_is_bootstrapped_at_its_time_limits():

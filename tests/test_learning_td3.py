@@ -103,7 +103,7 @@ def test_the_actor_climbs_the_first_critic_of_its_own_seed() -> None:
     assert all(p.grad is None for p in agent.critics.parameters())
 
 
-def test_the_actor_step_is_bounded_by_the_clip_of_dq_da() -> None:
+def test_clips_bound_the_actor_step_and_each_seed_by_itself() -> None:
     gradients = []
     for clip in (None, 1e-3):
         agent, replay = learner([4], action_gradient_clip=clip)
@@ -111,14 +111,10 @@ def test_the_actor_step_is_bounded_by_the_clip_of_dq_da() -> None:
         gradients.append(max(float(p.grad.abs().max()) for p in agent.actor.parameters()))
     assert gradients[1] <= 1e-3 * 5  # |x|, |tanh'| and the mean over the batch
     assert gradients[0] > 3 * gradients[1]
-
-
-def test_gradient_clip_bounds_each_seed_by_itself() -> None:
     agent, replay = learner([4, 6], gradient_clip=0.01)
     agent._update_critics(replay.sample(32))
     for parameter in agent.critics.parameters():
-        norms = parameter.grad.view(2, -1).norm(dim=1)
-        assert (norms <= 0.01 * (1 + 1e-5)).all()
+        assert (parameter.grad.view(2, -1).norm(dim=1) <= 0.01 * (1 + 1e-5)).all()
 
 
 def test_the_actor_waits_for_the_critics_head_start() -> None:
@@ -134,13 +130,17 @@ def test_memory_keeps_the_newest_and_names_bad_input() -> None:
     replay = Replay([0], 1, 1, capacity=5)
     with pytest.raises(ValueError, match="empty"):
         replay.sample(2)
+
+    def rows(count, value=0.0, size=1):
+        shape = (1, count)
+        wide = np.full((*shape, size), value)
+        return wide, np.zeros((*shape, 1)), np.zeros(shape), wide, np.ones(shape)
+
     for value in range(8):
-        replay.add(*np.full((2, 1, 1, 1), value), *np.full((1, 1, 1), value),
-                   *np.full((1, 1, 1, 1), value), np.ones((1, 1)))  # fmt: skip
+        replay.add(*rows(1, value))
     assert sorted(replay.rows[0, :, 0]) == [3, 4, 5, 6, 7]
     with pytest.raises(ValueError, match="wanted rows of"):
-        replay.add(np.zeros((1, 2, 3)), np.zeros((1, 2, 1)), np.zeros((1, 2)),
-                   np.zeros((1, 2, 1)), np.zeros((1, 2)))  # fmt: skip
+        replay.add(*rows(2, size=3))
     with pytest.raises(ValueError, match="positive sizes"):
         Replay([], 1, 1, 5)
     with pytest.raises(ValueError, match="discount"):

@@ -3,18 +3,15 @@
 import numpy as np
 import pytest
 from lesson import run
+from scipy.integrate import solve_ivp
 
-from cmc import exercises, plants
 from cmc.theory.certificates import circle_criterion
 from cmc.theory.certify import certify
-from cmc.theory.contraction import floquet_multipliers
 
 
 @pytest.fixture(scope="module")
 def whole():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CMC_FAST", "1")
-        return run("05")
+    return run("05")
 
 
 def test_the_same_weights_lose_with_signs_and_settle_without(whole):
@@ -65,10 +62,14 @@ def test_the_floor_is_where_a_growing_mode_turns_stable(whole):
 
 
 def test_the_breathing_loop_grows_although_every_instant_decays(whole):
-    loop = plants.FloquetLoop()
-    multipliers = floquet_multipliers(lambda t: loop.jacobian(t, np.zeros(2)), loop.period)
+    def rhs(t, s):
+        return [-0.1 * s[0] - (1 + 0.5 * np.cos(2 * t)) * s[1], s[0]]
+
+    ends = [solve_ivp(rhs, (0, np.pi), e, rtol=1e-10, atol=1e-12).y[:, -1] for e in np.eye(2)]
+    multipliers = np.sort(np.linalg.eigvals(np.transpose(ends)))  # over one period of J(t)
+    np.testing.assert_allclose(multipliers, [-1.263, -0.579], atol=5e-4)
     found = np.exp(whole.space["log_growth"](0.1, 0.5))
-    assert found == pytest.approx(np.abs(multipliers[0]), rel=1e-5)
+    assert found == pytest.approx(-multipliers[0], rel=1e-5)
     assert "largest real part of J(t) at any instant: -0.050" in whole.text
     assert "multiplies the largest displacement by 1.263" in whole.text
 
@@ -146,47 +147,3 @@ def test_the_sampled_formula_is_what_is_measured(whole):
         L, R, q = whole.space["Lambda"], whole.space["R"], 0.25 * p / whole.space["tau"]
         stable = p + h / 2 * q < L / R / np.tanh(L * h / 2)
         assert ("unstable" not in shown["text"]) == stable
-
-
-@pytest.mark.parametrize(
-    ("name", "answer", "reason"),
-    [
-        ("05-slopes", lambda W, b, s: np.linalg.multi_dot(W[::-1])[0], "W_l ... W_1 alone"),
-        ("05-slopes", lambda W, b, s: 1.0, "two slopes"),
-        ("05-pump", lambda z, w: 1.0, "still decays|decays as fast"),
-        ("05-pump", lambda z, w: 0.5 if z * w < 0 else 1.5, "decays"),
-        ("05-pump", lambda z, w: 2.0, "should stay in"),
-        (
-            "05-quadrature",
-            lambda p, q, L, R, h: (
-                np.array(
-                    [
-                        [np.exp(L * h) - R * np.expm1(L * h) / L * (p + h * q), 0.0],
-                        [h, 1.0],
-                    ]
-                )
-                - np.array([[0, R * np.expm1(L * h) / L * q], [0, 0]])
-            ),
-            "matrix of the text",
-        ),
-        (
-            "05-own-plant",
-            lambda: (np.diag([-1.0, -2.0]), np.eye(2), np.ones((2, 2)), np.ones((2, 2)), 0.1),
-            "f_y is diagonal",
-        ),
-        (
-            "05-own-plant",
-            lambda: (
-                [[-1.0, 0.5], [0.2, -3.0]],
-                [[1.0, 0.3], [0.4, 2.0]],
-                [[0.5, 0.3]] * 2,
-                [[2.0, 1.0]] * 2,
-                0.05,
-            ),
-            "at 1.1 h",
-        ),
-    ],
-)
-def test_wrong_answers_get_a_fitting_hint(name, answer, reason):
-    line = repr(exercises.check(name, answer))
-    assert any(word in line for word in reason.split("|")), line

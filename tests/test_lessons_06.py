@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from lesson import lesson, run
 
-from cmc import exercises
 from cmc.theory.composite import composite
 
 GAINS = """
@@ -16,9 +15,7 @@ arm = TwoLinkArm(lengths=(0.5, 0.4), masses=(2.0, 1.0))
 
 @pytest.fixture(scope="module")
 def whole():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CMC_FAST", "1")
-        return run("06")
+    return run("06")
 
 
 @pytest.fixture(scope="module")
@@ -132,9 +129,7 @@ def test_the_error_falls_as_one_over_the_root(whole):
 
 
 def test_other_gains_give_their_own_figures():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CMC_FAST", "1")
-        other = run("06", plant=GAINS.format(K_p=[12.0, 30.0, 5.0], K_d=[8.0, 25.0, 9.0], lam=1.2))
+    other = run("06", plant=GAINS.format(K_p=[12.0, 30.0, 5.0], K_d=[8.0, 25.0, 9.0], lam=1.2))
     assert "it uses the first ones" in other.text
     poles = np.sort(np.roots([1.2, 8.0, 12.0]).real)
     assert other.space["B"] / other.space["A"] == pytest.approx(-poles[1])
@@ -144,33 +139,11 @@ def test_other_gains_give_their_own_figures():
 
 
 @pytest.mark.parametrize(
-    ("K_d", "reason"), [([12.0, 20.0], "no real composite variable"), ([-3.0, 5.0], "must be > 0")]
+    ("K_d", "reason"),
+    [([12.0, 20.0], "no real composite variable"), ([-3.0, 5.0], "K_d needs positive values")],
 )
 def test_gains_without_a_composite_variable_are_refused_and_replaced(K_d, reason):
     found = lesson("06", plant=GAINS.format(K_p=[40.0, 40.0], K_d=K_d, lam=1.0))
     assert (found["K_d"] ** 2 >= 4 * found["K_p"] * found["lambda_d"]).all()
     with pytest.raises(ValueError, match=reason):
         composite([40.0, 40.0], K_d, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("name", "answer", "reason"),
-    [
-        ("06-design", lambda s, f, g: (s + f, s * f, 0.01), "not the reverse"),
-        ("06-design", lambda s, f, g: (s * f, s + f, 1e-4), "can be longer"),
-        ("06-design", lambda s, f, g: (s * f, s + f, 2.0 / (s + f)), "too long"),
-        ("06-verdict", lambda K_p, K_d, g, dt: "settles", "yours 'settles'"),
-        (
-            "06-verdict",
-            lambda p, d, g, dt: (
-                "alternates" if (d + g * composite(p, d).K2) * dt > 1 else "settles"
-            ),
-            "the level alone does not tell",
-        ),
-        ("06-commands", lambda n: np.full((n, 2), 3.0), "look alike"),
-        ("06-commands", lambda n: np.full((n, 2), 4.0), "beyond 3"),
-        ("06-commands", lambda n: np.random.default_rng(0).uniform(-3, 3, (n, 2)), "of the random"),
-    ],
-)
-def test_wrong_answers_get_a_fitting_hint(name, answer, reason):
-    assert reason in repr(exercises.check(name, answer))

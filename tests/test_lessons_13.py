@@ -5,14 +5,17 @@ from __future__ import annotations
 import gymnasium
 import nbformat
 import numpy as np
-import pandas as pd
 import pytest
+import torch
 from lesson import lesson
 
-from cmc import exercises, store
+from cmc import store
 from cmc.envs.auxiliary_space import AuxiliarySpaceVectorWrapper
 from cmc.envs.plant_env import PlantVectorEnv
 from cmc.policies import ModularPolicy, PositiveNetwork
+from cmc.results import tidy
+from cmc.robot.two_link import TwoLinkArm
+from cmc.studies import composition
 from cmc.theory.certify import certify
 from cmc.theory.combinations import transforms_that_fit
 from cmc.theory.exact import Region
@@ -80,6 +83,8 @@ def test_the_vector_wrapper_is_the_loop_that_is_certified():
     np.testing.assert_allclose(info["final_obs"].reshape(2, 2, 2)[..., 0], path.z[6], atol=1e-5)
     fresh = seen.reshape(2, 2, 2)  # the integral starts with the first error
     np.testing.assert_allclose(fresh[..., 1], h * fresh[..., 0], rtol=1e-5)
+    with pytest.raises(ValueError, match="actions needs finite values"):
+        wrapped.step([[np.nan, 0.0], [0.0, 0.0]])
     with pytest.raises(TypeError, match="AuxiliarySpace"):
         AuxiliarySpaceVectorWrapper(env, lambda y: space)
 
@@ -150,22 +155,27 @@ def test_what_a_limit_of_two_nm_can_do():
 
 
 def test_the_composite_signal_obeys_its_linear_model():
-    env = HERE["Composite"](gymnasium.make("Pendulum-v1"))
+    env = HERE["Upright"](gymnasium.make("Pendulum-v1"))
     env.unwrapped.dt = h = 1e-4  # Gymnasium's own step is too long for a derivative
     env.reset(seed=0)
     env.unwrapped.state = np.array([0.2, 0.1])
-    y = np.array([-(4.0 * 0.2 + 0.1)])  # K1 e + K2 e' with e = -angle
+
+    def signal():
+        angle, speed = env.unwrapped.state
+        return HERE["signal"]([np.cos(angle), np.sin(angle), speed])
+
+    y, u = signal(), np.array([0.1])
+    np.testing.assert_allclose(y, -(4.0 * 0.2 + 0.1))  # K1 e + K2 e' with e = -angle
     f_y, f_u = HERE["pole"].f_y(y, y)[0, 0], HERE["pole"].f_u(y, y)[0, 0]
-    u = np.array([0.1])
     for _ in range(10):
-        after = env.step(u)[0]
-        np.testing.assert_allclose((after - y) / h, f_y * y + f_u * u, atol=2e-3)
-        y = after
+        env.step(u)
+        np.testing.assert_allclose((signal() - y) / h, f_y * y + f_u * u, atol=2e-3)
+        y = signal()
 
 
 @pytest.fixture(scope="module")
 def peers():
-    return pd.read_csv(store.asset("peers", "own_plant.csv"))
+    return tidy("own_plant")
 
 
 def test_what_is_said_about_the_peers(peers):
@@ -184,6 +194,30 @@ def test_what_is_said_about_the_peers(peers):
     assert (peers[["unstable"]] == 0).to_numpy().all()
 
 
+def test_what_is_said_about_the_composition():
+    costs = tidy("composition")
+    above = costs.pivot(index="test", columns="method", values="above_percent").round(1)
+    assert above.loc["pendulum"].to_dict() == {
+        "hand-made": 2.1, "learned": 0.4, "learned, wide bounds": 1.8, "optimum": 0.0
+    }  # fmt: skip
+    assert above.loc["two-link arm"].round().tolist() == [21, 10, 14, 0]
+    certified = costs.set_index("method").rate
+    assert (certified[["hand-made", "learned"]] > 0.04).all()
+    assert certified[["learned, wide bounds", "optimum"]].isna().all()
+
+
+def test_the_prices_are_the_torques_of_the_mechanisms():
+    rng = np.random.default_rng(0)
+    e, e_dot, p = rng.normal(size=(3, 5, 2))
+    arm = TwoLinkArm(gravity=0.0)
+    q, dq = [0.3, np.pi / 2] - e, -e_dot
+    wanted = (arm.inertia(q) @ p[..., None])[..., 0] + arm.bias(q, dq)
+    found = composition.arm_torque(*(torch.as_tensor(x) for x in (e, e_dot, p)))
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+    tau = composition.pendulum_torque(*(torch.as_tensor(x[:, :1]) for x in (e, e_dot, p)))
+    np.testing.assert_allclose(15 * np.sin(-e[:, :1]) + 3 * tau.numpy(), p[:, :1])  # -e'' = p
+
+
 def test_the_template_runs_outside_of_the_repository(tmp_path, monkeypatch, capsys):
     import matplotlib
 
@@ -199,23 +233,3 @@ def test_the_template_runs_outside_of_the_repository(tmp_path, monkeypatch, caps
         exec(compile(cell.source, cell.id, "exec"), space)
     assert space["answer"]
     assert "contracting" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("name", "wrong", "message"),
-    [
-        ("13-order", lambda f_y: list(range(len(f_y))), "after it"),
-        ("13-order", lambda f_y: None, "an order exists"),
-        ("13-hold", lambda proved, low, high: low, "falls short"),
-        ("13-hold", lambda proved, low, high: high, "not proved"),
-        ("13-hold", lambda p, a, b: max(h for h in np.arange(a, b, 0.001) if p(h)), "questions"),
-        ("13-angle", lambda limit: limit / 5, "can hold"),
-        ("13-angle", lambda limit: np.arcsin(limit / 5) if limit < 5 else np.pi, "90 degrees"),
-        ("13-own", lambda: 3, "five things"),
-        ("13-own", lambda: (lambda y, u: u - y, ([-1, -1], [1, 1]), (-1, 1), 1, 2), "linear"),
-    ],
-)
-def test_exercises_name_the_slip(name, wrong, message):
-    verdict = exercises.check(name, wrong)
-    assert not verdict
-    assert message in repr(verdict)

@@ -1,9 +1,7 @@
-"""The shape of the package: imports go one way, importing it is light, and the wheel is whole."""
+"""The shape of the package: importing it is light, and the wheel is whole."""
 
 from __future__ import annotations
 
-import ast
-import graphlib
 import subprocess
 import sys
 import zipfile
@@ -12,112 +10,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGE = ROOT / "cmc"
-
-# A room may import rooms further down; `view` stands apart, and leaves are open to all.
-ORDER = [
-    "__main__",
-    "exercises",
-    "sb3",
-    "studies",
-    "results",
-    "learning",
-    "envs",
-    "robot",
-    "policies",
-    "plants",
-    "theory",
-]
-LEAVES = {"store", "fast"}
-ALONE = {"view", "notation"}
-
-
-def room(path: Path) -> str:
-    """The room a source file belongs to: its folder in the package, or its own name."""
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-
-
-def imported_rooms(path: Path) -> set[str]:
-    """Rooms of cmc that a file imports, at its top or inside its functions."""
-    rooms: set[str] = set()
-    package = ["cmc", *path.relative_to(PACKAGE).parent.parts]
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) - node.level + 1] if node.level else []
-            stem = ".".join([*base, *([node.module] if node.module else [])])
-            names = [f"{stem}.{alias.name}" for alias in node.names]
-        else:
-            continue
-        rooms |= {name.split(".")[1] for name in names if name.startswith("cmc.")}
-    return rooms
-
-
-SOURCES = sorted(p for p in PACKAGE.rglob("*.py") if p.parent != PACKAGE or p.name != "__init__.py")
-
-
-@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_go_down_only(path: Path) -> None:
-    here = room(path)
-    others = imported_rooms(path) - {here} - {"__version__"}
-    if here in LEAVES:
-        allowed: set[str] = set()
-    elif here in ALONE:
-        allowed = LEAVES
-    else:
-        assert here in ORDER, f"{here} is a new room: give it a place in the order"
-        allowed = LEAVES | set(ORDER[ORDER.index(here) + 1 :])
-        if here == "__main__":
-            allowed |= ALONE
-    assert others <= allowed, f"{here} must not import {sorted(others - allowed)}"
-
-
-def test_the_import_check_sees_every_form_of_import(tmp_path: Path) -> None:
-    source = PACKAGE / "theory" / "_probe.py"
-    text = "import cmc.envs\nfrom cmc import plants\nfrom ..view import figures\nfrom . import x\n"
-    node_rooms = imported_rooms_of(text, source)
-    assert {"envs", "plants", "view", "theory"} <= node_rooms
-
-
-def imported_modules(path: Path, modules: set[str]) -> set[str]:
-    """Modules of cmc that a file imports, at its top or inside its functions."""
-    here = ["cmc", *path.relative_to(PACKAGE).with_suffix("").parts]
-    package = here[:-1]
-    found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) - node.level + 1] if node.level else []
-            stem = ".".join([*base, *([node.module] if node.module else [])])
-            names = {f"{stem}.{alias.name}" for alias in node.names}
-            found |= names & modules or {stem}
-            found |= {stem} if names - modules else set()
-    return (found & modules) - {".".join(here)}
-
-
-def test_no_import_goes_round_in_a_circle() -> None:
-    """Inside of packages too, and imports inside of functions count."""
-    names = {p: ".".join(["cmc", *p.relative_to(PACKAGE).with_suffix("").parts]) for p in SOURCES}
-    names = {p: name.removesuffix(".__init__") for p, name in names.items()}
-    modules = set(names.values())
-    graph = {name: imported_modules(path, modules) for path, name in names.items()}
-    assert sum(map(len, graph.values())) > len(graph)  # arrows were found
-    try:
-        graphlib.TopologicalSorter(graph).prepare()
-    except graphlib.CycleError as error:
-        pytest.fail("imports go round: " + " -> ".join(error.args[1]))
-
-
-def imported_rooms_of(text: str, pretended: Path) -> set[str]:
-    """`imported_rooms` of a text that pretends to stand at a path."""
-
-    class Pretended(type(pretended)):  # type: ignore[misc]
-        def read_text(self, encoding: str | None = None, **_: object) -> str:
-            return text
-
-    return imported_rooms(Pretended(pretended))
 
 
 def python(code: str) -> str:

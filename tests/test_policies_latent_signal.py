@@ -6,11 +6,11 @@ import torch
 from scipy.linalg import solve_continuous_are
 
 from cmc.policies import PositiveNetwork
-from cmc.policies.latent_signal import LatentSignal, improve
+from cmc.policies.latent_signal import LatentSignal, Trial, improve
 from cmc.robot.two_link import TwoLinkArm
 from cmc.theory.certificates import rate_in
 from cmc.theory.composite import certify_latent, composite
-from cmc.theory.jacobians import differences
+from cmc.theory.identification import differences
 from cmc.theory.simulate import flow
 
 KP, KD = 4.0, 5.0
@@ -123,24 +123,29 @@ def test_the_two_link_arm_keeps_the_promise():
 
 
 def test_learning_the_signal_recovers_most_of_what_the_hand_made_one_costs():
-    """Cost int e^2 + .01 p^2 from unit errors: hand-made, learned, and the LQR optimum."""
-    effort, duration, kp, kd = 0.01, 4.0, 1.0, 2.5
-    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
-    P = solve_continuous_are(A, B, np.diag([1.0, 0.0]), [[effort]])
+    """Cost int e^2 + .01 p^2: hand-made, learned, and the optimum, which Riccati's equation has."""
     starts = np.array([[[1.0, 0.0]], [[-1.0, 0.5]]])
-    best = np.mean([s[0] @ P @ s[0] for s in starts])
-    options = {"effort": effort, "duration": duration, "updates": 60, "rate": 0.05, "steps": 60}
-    model = composite(kp, kd)
-    fixed = float(model.K1), float(model.K2)
+    trial = Trial(starts, effort=0.01, duration=4.0, steps=60)
+    A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
+    P = solve_continuous_are(A, B, np.diag([1.0, 0.0]), [[0.01]])
+    best = trial.optimum()
+    # a sum from the left end of each step counts h/2 of the first e^2 too much
+    exact = np.mean([s[0] @ P @ s[0] for s in starts]) + 4.0 / 60 / 2
+    assert best == pytest.approx(exact, rel=0.02)
+    costs = []
+    model = composite(1.0, 2.5)
+    hand = lambda e, e_dot: float(model.K1) * e + float(model.K2) * e_dot  # noqa: E731
+    for signal in (hand, LatentSignal(1, slope_min=[0.2, 0.05], slope_max=3.0, hidden=(8,))):
+        pi = policy(1, low=(0.1, 0.0), high=(20.0, 1e-6))
+        found = improve(signal, pi, (1.0, 2.5), trial, updates=60, rate=0.05)
+        assert found[-1] < found[0]
+        costs.append(found[-1])
+    assert best < costs[1] < costs[0]
+    assert costs[1] - best < 0.6 * (costs[0] - best)
 
-    class HandMade(torch.nn.Module):
-        def forward(self, e, e_dot):
-            return fixed[0] * e + fixed[1] * e_dot
 
-    caps = {"low": (0.1, 0.0), "high": (20.0, 1e-6)}
-    hand = improve(HandMade(), policy(1, **caps), (kp, kd), starts, **options)
-    free = LatentSignal(1, slope_min=[0.2, 0.05], slope_max=[3.0, 3.0], hidden=(8,))
-    learned = improve(free, policy(1, **caps), (kp, kd), starts, **options)
-    assert learned[-1] < learned[0]
-    assert best * 0.97 < learned[-1] < hand[-1]
-    assert learned[-1] - best < 0.6 * (hand[-1] - best)
+def test_the_least_cost_counts_what_is_priced():
+    """With twice the command priced the optimum is that of four times the effort."""
+    starts = [[[1.0, 0.0]]]
+    double = Trial(starts, 0.01, 2.0, 20, priced=lambda e, e_dot, p: 2 * p).optimum()
+    assert double == pytest.approx(Trial(starts, 0.04, 2.0, 20).optimum(), rel=1e-4)

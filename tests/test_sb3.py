@@ -27,10 +27,10 @@ from cmc.sb3 import (
     ConvexGradientPolicy,
     IndependentPolicy,
 )
-from cmc.theory.action import action_of
 from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.certify import certify
 from cmc.theory.exact import Region
+from cmc.theory.slopes import action_of
 
 PEG = "cmc.envs:cmc/PegTouch-v0"
 
@@ -80,19 +80,23 @@ def test_learns_as_ours_does():
     assert abs(theirs - ours.mean()) < 3.0 * max(ours.std(ddof=1), 3.0)
 
 
+def saved_and_loaded_alike(model, observation, folder):
+    """The whole model and its policy alone act as before after a round trip."""
+    before = model.predict(observation, deterministic=True)[0]
+    model.save(folder / "model.zip")
+    again = type(model).load(folder / "model.zip", device="cpu")
+    assert type(again.policy) is type(model.policy)
+    model.policy.save(folder / "policy.pt")
+    for other in (again, type(model.policy).load(folder / "policy.pt")):
+        np.testing.assert_array_equal(other.predict(observation, deterministic=True)[0], before)
+
+
 @pytest.mark.parametrize("kind", [ContractingPolicy, IndependentPolicy, ConvexGradientPolicy])
 def test_save_and_load(tmp_path, kind):
     model = SB3PPO(kind, PegTouchEnv(), n_steps=64, policy_kwargs=KWARGS, device="cpu", seed=3)
     model.learn(128)
     observation = np.random.default_rng(0).standard_normal((9, 4)).astype(np.float32)
-    before = model.predict(observation, deterministic=True)[0]
-    model.save(tmp_path / "model.zip")
-    again = SB3PPO.load(tmp_path / "model.zip", device="cpu")
-    assert isinstance(again.policy, kind)
-    np.testing.assert_array_equal(again.predict(observation, deterministic=True)[0], before)
-    model.policy.save(tmp_path / "policy.pt")
-    alone = kind.load(tmp_path / "policy.pt")
-    np.testing.assert_array_equal(alone.predict(observation, deterministic=True)[0], before)
+    saved_and_loaded_alike(model, observation, tmp_path)
 
 
 def test_the_promised_slopes_hold_in_the_action_that_is_taken():
@@ -104,23 +108,14 @@ def test_the_promised_slopes_hold_in_the_action_that_is_taken():
     low, high = model.policy.slope_bounds()
     assert (low >= 0.05 - 1e-7).all()
     assert (high <= np.array(caps["slope_max"]) * (1 + 1e-6)).all()
-    slope = torch.stack(
-        [
-            torch.autograd.grad(mean[:, i].sum(), observation, retain_graph=True)[0]
-            for i in range(2)
-        ],
-        1,
-    ).reshape(200, 2, 2, 2)
-    own = torch.einsum("biij->bij", slope) * torch.tensor([-1.0, 1.0])[:, None]
+    rows = [torch.autograd.grad(mean[:, i].sum(), observation, retain_graph=True) for i in (0, 1)]
+    slope = torch.stack([row[0].reshape(200, 2, 2)[:, i] for i, row in enumerate(rows)], 1)
+    own = slope * torch.tensor([-1.0, 1.0])[:, None]
     torch.testing.assert_close(own, model.policy.jacobian(observation.detach().view(200, 2, 2)))
     assert (own >= torch.as_tensor(low) - 1e-6).all()
     assert (own <= torch.as_tensor(high) + 1e-6).all()
     optimised = {id(p) for group in model.policy.optimizer.param_groups for p in group["params"]}
     assert optimised == {id(p) for p in model.policy.parameters()}
-
-
-def test_negative_weights_are_refused():
-    model = SB3PPO(ContractingPolicy, PegTouchEnv(), device="cpu")
     state = model.policy.state_dict()
     state["action_net.network.mlp.weights.0"] -= 10.0
     with pytest.raises(NegativeWeightError, match="action_net"):
@@ -142,17 +137,6 @@ def test_batched_environment_reports_what_ended():
         assert info["TimeLimit.truncated"]
         assert not np.allclose(info["terminal_observation"], observation[index])
     assert env.get_attr("num_envs", [0, 2]) == [3, 3]
-
-
-def test_spaces_that_do_not_fit():
-    schedule = lambda _: 1e-3  # noqa: E731
-    action, seen = spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (5,))
-    with pytest.raises(ValueError, match=r"shape \(4,\)"):
-        ContractingPolicy(seen, action, schedule)
-    with pytest.raises(ValueError, match="Box of one axis"):
-        ContractingPolicy(seen, spaces.Discrete(3), schedule)
-    policy = ContractingPolicy(seen, action, schedule, layout={"s": slice(1, 5)})
-    assert policy.actor.n == 2
 
 
 def lags(scales=None, clip_obs=10.0):
@@ -208,8 +192,14 @@ def test_what_the_theory_sees_is_what_the_model_does():
     np.testing.assert_allclose(taken, wanted, atol=1e-5)
 
 
-def test_edges_of_other_algorithms_and_layouts():
-    peg = PegTouchEnv()
+def test_edges_of_other_algorithms_spaces_and_layouts():
+    peg, rate = PEG, lambda _: 1e-3  # pictures are asked for and refused, and all goes on
+    action, seen = spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (5,))
+    with pytest.raises(ValueError, match=r"shape \(4,\)"):
+        ContractingPolicy(seen, action, rate)
+    with pytest.raises(ValueError, match="Box of one axis"):
+        ContractingPolicy(seen, spaces.Discrete(3), rate)
+    assert ContractingPolicy(seen, action, rate, layout={"s": slice(1, 5)}).actor.n == 2
     model = SB3PPO(ContractingPolicy, peg, policy_kwargs={"net_arch": {"pi": [16]}}, n_steps=64)
     assert model.policy.net_arch["vf"] == []
     kwargs = {"layout": {"s": slice(0, 9)}}
@@ -227,15 +217,6 @@ def test_edges_of_other_algorithms_and_layouts():
         TD3(ContractingTD3Policy, gymnasium.make("Pendulum-v1"), buffer_size=10)
     with pytest.raises(ValueError, match="restarts in the same step"):
         BatchedVecEnv(gymnasium.make_vec(PEG, num_envs=2, vectorization_mode="sync"))
-
-
-def test_the_policy_that_ppo_holds_can_be_certified_in_a_box():
-    slopes = {"slope_min": 0.2, "slope_max": [0.6, 0.6]}
-    kwargs = {"network_kwargs": slopes}
-    model = SB3PPO(ContractingPolicy, PegTouchEnv(), policy_kwargs=kwargs, n_steps=64)
-    region = Region([1.0, -8.0], [3.0, -1.0])
-    answer = certify(model.policy, plants.get("peg"), region=region, y_ref=[2.0, -4.0])
-    assert not answer.refused, str(answer)
 
 
 class Slow(gymnasium.Env):
@@ -280,12 +261,7 @@ def test_the_contracting_actor_of_td3_acts_and_is_saved(td3, tmp_path):
     assert set(map(id, td3.actor.optimizer.param_groups[0]["params"])) == set(
         map(id, td3.actor.parameters())
     )
-    td3.save(tmp_path / "model.zip")
-    again = TD3.load(tmp_path / "model.zip", device="cpu")
-    np.testing.assert_array_equal(again.predict(s, deterministic=True)[0], taken)
-    td3.policy.save(tmp_path / "policy.pt")
-    alone = ContractingTD3Policy.load(tmp_path / "policy.pt")
-    np.testing.assert_array_equal(alone.predict(s, deterministic=True)[0], taken)
+    saved_and_loaded_alike(td3, s, tmp_path)
 
 
 def test_the_contracting_actor_of_td3_keeps_its_signs_and_caps(td3):
@@ -302,12 +278,16 @@ def test_the_contracting_actor_of_td3_keeps_its_signs_and_caps(td3):
         assert (other == 0).all()
 
 
-def test_td3_is_certified_where_tanh_is_not_flat(td3):
+def test_what_the_algorithms_hold_can_be_certified_in_a_box(td3):
+    slopes = {"slope_min": 0.2, "slope_max": [0.6, 0.6]}
+    kwargs = {"network_kwargs": slopes}
+    ppo = SB3PPO(ContractingPolicy, PegTouchEnv(), policy_kwargs=kwargs, n_steps=64)
+    region = Region([1.0, -8.0], [3.0, -1.0])
+    answer = certify(ppo.policy, plants.get("peg"), region=region, y_ref=[2.0, -4.0])
+    assert not answer.refused, str(answer)
     plant = plants.LinearPlant(np.diag(Slow.A), np.diag(Slow.B))
     own = AuxiliarySpace.identity(plant.f_y([0, 0], [0, 0]), plant.f_u([0, 0], [0, 0]))
-    answer = certify(td3.policy, plant, transforms=own)
-    assert not answer
-    assert "no floor" in answer.reason
+    assert "no floor" in certify(td3.policy, plant, transforms=own).reason  # tanh is flat
     near = Region([-0.3] * 2, [0.3] * 2, integral=0.3)
     assert certify(td3.policy, plant, region=near, transforms=own)
     assert "wrong way" in certify(td3.policy, plant, region=near).reason  # decompose has R > 0

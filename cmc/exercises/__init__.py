@@ -1,6 +1,6 @@
 """What the exercises of the course are checked with.
 
-A lesson's checks live in `cmc/exercises/lesson_NN.py` and are loaded when one of them is asked for:
+Checks live in `cmc/exercises/lessons_*.py` and are loaded when one of them is asked for:
 
     @check("02-sign-rule")
     def sign_rule(answer): ...      # raises AssertionError, by `expect`, with a helpful sentence
@@ -12,8 +12,7 @@ the lesson.
 from __future__ import annotations
 
 import importlib
-import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, overload
 
@@ -24,8 +23,9 @@ Judge = Callable[[Any], None]
 
 CHECKS: dict[str, Judge] = {}
 """Checks that have been loaded, by name."""
+_FILES = {"00_04": range(5), "05_07": range(5, 8), "08_09": (8, 9), "10_13": range(10, 14)}
 
-__all__ = ["CHECKS", "Verdict", "check", "expect", "expect_close", "judge", "names"]
+__all__ = ["CHECKS", "Verdict", "check", "expect", "expect_close", "names", "numbers"]
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,9 @@ def check(name: str, answer: Any, /) -> Verdict: ...
 def check(name: str, *answer: Any) -> Any:
     """Judge an answer, or, without one, register the decorated function as the judge of `name`.
 
-    Args:
-        name: the exercise, `"NN-short-title"`.
-        answer: what the reader wrote: a function, an array or a number; `...` is not written yet.
-
-    Returns:
-        A `Verdict`, or the decorator. A wrong or unwritten answer, or one that fails, is a verdict
-        too: a notebook runs on.
+    The name is `"NN-short-title"`; an answer is what the reader wrote, a function, an array or a
+    number, and `...` is not written yet. A wrong or unwritten answer, or one that fails, is a
+    `Verdict` too: a notebook runs on.
 
     Raises:
         KeyError: if there is no such exercise.
@@ -67,35 +63,29 @@ def check(name: str, *answer: Any) -> Any:
         raise ValueError(f"wanted a name like '02-sign-rule', got {name!r}")
     if not answer:
         return lambda judge: _register(name, judge)
-    _find(name)
-    if answer[0] is ...:
-        return Verdict(False, f"{name}: not written yet.")
+    known = names(name[:2])
+    if name not in known:
+        raise KeyError(f"no exercise {name!r}; lesson {name[:2]} has: {', '.join(known) or 'none'}")
+    said = "solved."
     try:
-        judge(name, *answer)
+        if answer[0] is ...:
+            raise NotImplementedError
+        CHECKS[name](*answer)
     except NotImplementedError:
-        return Verdict(False, f"{name}: not written yet.")
+        said = "not written yet."
     except AssertionError as error:
-        return Verdict(False, f"{name}: {error}")
+        said = str(error)
     except Exception as error:
-        kind = type(error).__name__
-        return Verdict(False, f"{name}: your code stopped with {kind}: {error}")
-    return Verdict(True, f"{name}: solved.")
-
-
-def judge(name: str, answer: Any) -> None:
-    """Judge an answer by raising: nothing if it is right.
-
-    Raises:
-        AssertionError: if the answer is wrong, with a sentence that says what was wanted.
-        NotImplementedError: if the answer is a stub that was not written yet.
-        KeyError: if there is no such exercise.
-    """
-    _find(name)(answer)
+        said = f"your code stopped with {type(error).__name__}: {error}"
+    return Verdict(said == "solved.", " ".join(f"{name}: {said}".split()))
 
 
 def names(lesson: str) -> list[str]:
     """Names of the exercises of lesson `"NN"`."""
-    _load(lesson)
+    files = [name for name, lessons in _FILES.items() if int(lesson) in lessons]
+    if not files:
+        raise KeyError(f"lesson {lesson!r} has no exercises")
+    importlib.import_module(f"{__name__}.lessons_{files[0]}")
     return [name for name in CHECKS if name.startswith(f"{lesson}-")]
 
 
@@ -105,22 +95,12 @@ def expect(holds: Any, otherwise: str) -> None:
         raise AssertionError(f"Not yet: {otherwise}")
 
 
-def expect_close(
-    value: ArrayLike, wanted: ArrayLike, what: str, *, rtol: float = 1e-6, atol: float = 1e-9
-) -> None:
-    """Compare an answer with an array and say in words where they differ.
-
-    Args:
-        value: the reader's array.
-        wanted: the right one.
-        what: what it is called in the message.
-        rtol: relative tolerance.
-        atol: absolute tolerance.
+def numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """The reader's answer as an array of finite numbers of this shape, called `what` in messages.
 
     Raises:
-        AssertionError: if the answer is no array of numbers, or differs in shape or in value.
+        AssertionError: if it is none.
     """
-    right = np.asarray(wanted)
     expect(value is not None, f"{what} is None; does your function return something?")
     try:
         found = np.asarray(value, dtype=complex if np.iscomplexobj(value) else float)
@@ -128,35 +108,48 @@ def expect_close(
         raise AssertionError(
             f"Not yet: {what} should be numbers, got {type(value).__name__}"
         ) from None
-    expect(
-        found.shape == right.shape,
-        f"{what} should have shape {right.shape}, yours has {found.shape}",
-    )
-    near = np.isclose(found, right, rtol=rtol, atol=atol)
-    if not near.all():
-        where = tuple(int(i) for i in np.argwhere(~near)[0])
-        place = f" at {where}" if where else ""
-        expect(False, f"{what}{place} should be {right[where]:.6g}, yours is {found[where]:.6g}")
+    expect(found.shape == shape, f"{what} should have shape {shape}, yours has {found.shape}")
+    bad = np.argwhere(~np.isfinite(found))
+    expect(not len(bad), f"{what}{_place(bad)} should be finite")
+    return found
 
 
-def _find(name: str) -> Judge:
-    _load(name[:2])
-    if name not in CHECKS:
-        known = ", ".join(n for n in CHECKS if n[:2] == name[:2]) or "none"
-        raise KeyError(f"no exercise {name!r}; lesson {name[:2]} has: {known}")
-    return CHECKS[name]
+def expect_close(
+    value: Any,
+    wanted: ArrayLike,
+    what: str,
+    slips: Mapping[str, ArrayLike] | None = None,
+    *,
+    rtol: float = 1e-6,
+    atol: float = 1e-9,
+) -> np.ndarray:
+    """Compare an answer with an array, say in words where they differ, and return it.
+
+    `slips` are wrong answers by the hint that each deserves.
+
+    Raises:
+        AssertionError: if the answer is no array of numbers, or differs in shape or in value.
+    """
+    right = np.asarray(wanted)
+    found = numbers(value, right.shape, what)
+    bad = np.argwhere(~np.isclose(found, right, rtol=rtol, atol=atol))
+    if len(bad):
+        for hint, slip in (slips or {}).items():
+            expect(not np.allclose(found, slip, rtol=1e-4), hint)
+        where = tuple(bad[0])
+        said = f"should be {right[where]:.6g}, yours is {found[where]:.6g}"
+        expect(False, f"{what}{_place(bad)} {said}")
+    return found
+
+
+def _place(bad: np.ndarray) -> str:
+    """Where the first of some entries is, " at (i, j)", or nothing for a single number."""
+    return f" at {tuple(bad[0].tolist())}" if bad.size else ""
 
 
 def _register(name: str, judge: Judge) -> Judge:
-    known = CHECKS.get(name)
-    if known is not None and known.__module__ != judge.__module__:
+    known = CHECKS.setdefault(name, judge)
+    if known.__module__ != judge.__module__:
         raise ValueError(f"exercise {name!r} is already judged by {known.__module__}")
     CHECKS[name] = judge
     return judge
-
-
-def _load(lesson: str) -> None:
-    module = f"{__name__}.lesson_{lesson}"
-    if importlib.util.find_spec(module) is None:
-        raise KeyError(f"lesson {lesson!r} has no exercises")
-    importlib.import_module(module)

@@ -7,7 +7,7 @@ anew with every sub-goal. All worlds of all seeds move in step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,63 +15,49 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
-from cmc.envs.panda_task import CRITIC, PandaTask
+from cmc.envs.panda_task import PandaTask
 from cmc.learning.hiro import OffPolicyCorrection
-from cmc.learning.low_level import CriticLow, LowLevel, Segment, evaluate
+from cmc.learning.low_level import LowLevel, evaluate, rollout
 from cmc.learning.planning import Planning
-from cmc.learning.state import Arrays, Resumable, State, set_streams, streams, under, within
+from cmc.learning.state import Arrays, Resumable, State, under
 from cmc.learning.td3 import TD3, Replay
 
 Array = NDArray[np.float64]
-JOINT_STATE = ("joints", "joint_velocity", "joint_error")
-"""Observation fields of a low level that moves joints."""
 
 
 @dataclass(frozen=True)
 class HierarchyConfig:
-    """Rates and sizes of the two levels.
+    """Rates and sizes of the two levels; our choice where no table is named.
 
     Attributes:
-        worlds: worlds of each seed (our choice).
-        samples: environment steps of a seed between rounds of updates (`tab:para`: 1024). Updates
-            are spread evenly over the segments.
-        high_updates: planner updates for each round (`tab:para`: 100).
-        low_updates: low-level updates for each round.
-        low_updates_late: the same from `low_late` steps on, or None if they stay (our choice).
-        low_late: environment steps of a seed (our choice).
-        high_noise: standard deviation of the planner's noise, in half-ranges (our choice).
-        high_noise_end: what it falls to, linearly, or None if it stays (our choice).
+        samples: environment steps of a seed between rounds of updates, which are spread evenly over
+            the segments.
         redraw: probability that an entry of a sub-goal is replaced by a uniform draw, at first and
-            once it has fallen (our choice).
+            once it has fallen.
         burst: probability that a world begins `burst_segments` uniform sub-goals in a row, at first
-            and once it has fallen (our choice).
-        burst_segments: length of a burst (our choice).
-        noise_steps: environment steps of a seed until noise, redraws and bursts have fallen (our
-            choice).
+            and once it has fallen.
         rate_steps: environment steps of a seed between which the planner's Adam rates fall,
-            linearly, to a tenth, or None if they stay (our choice).
+            linearly, to a tenth, or None if they stay.
         warm_up: environment steps of a seed with random sub-goals, from which the low level alone
-            learns (our choice).
-        reward_scale: factor on the mean reward of a segment (our choice).
-        capacity: segments that the planner remembers (`tab:para`: 65536).
+            learns.
     """
 
-    worlds: int = 8
-    samples: int = 1024
-    high_updates: int = 100
-    low_updates: int = 100
-    low_updates_late: int | None = None
-    low_late: int = 60_000
-    high_noise: float = 0.3
-    high_noise_end: float | None = None
+    worlds: int = 8  # of each seed
+    samples: int = 1024  # `tab:para`
+    high_updates: int = 100  # of the planner in a round, `tab:para`
+    low_updates: int = 100  # of the low level in a round
+    low_updates_late: int | None = None  # the same from `low_late` on, or None if they stay
+    low_late: int = 60_000  # environment steps of a seed
+    high_noise: float = 0.3  # standard deviation of the planner's noise, in half-ranges
+    high_noise_end: float | None = None  # what it falls to, linearly, or None if it stays
     redraw: tuple[float, float] = (0.0, 0.0)
     burst: tuple[float, float] = (0.0, 0.0)
     burst_segments: int = 3
-    noise_steps: int = 500_000
+    noise_steps: int = 500_000  # steps of a seed until noise, redraws and bursts have fallen
     rate_steps: tuple[int, int] | None = None
     warm_up: int = 10_000
-    reward_scale: float = 1.0
-    capacity: int = 65536
+    reward_scale: float = 1.0  # factor on the mean reward of a segment
+    capacity: int = 65536  # segments that the planner remembers, `tab:para`
 
     def __post_init__(self) -> None:
         if min(self.worlds, self.samples, self.capacity) < 1:
@@ -123,6 +109,8 @@ class TwoLevel(Resumable):
         relabeller: changes the sub-goals of the planner's samples, or None.
     """
 
+    kept = ("steps", "burst", "streams", "planner", "replay", "low", "relabeller")
+
     def __init__(
         self,
         task: PandaTask,
@@ -143,10 +131,10 @@ class TwoLevel(Resumable):
         self.shape = (len(seeds), config.worlds)
         self.steps = 0  # environment steps of each seed
         self.success = np.full(len(seeds), np.nan)  # share of the last episodes that succeeded
-        self._generators = [np.random.default_rng([seed, 1, 17]) for seed in seeds]
+        self.streams = [np.random.default_rng([seed, 1, 17]) for seed in seeds]
         task.seed([1_000_003 * seed + k for seed in seeds for k in range(config.worlds)])
         self._obs = task.reset()
-        self._burst = np.zeros(self.shape, dtype=int)  # segments left of a burst
+        self.burst = np.zeros(self.shape, dtype=int)  # segments left of a burst
         size = planning.observe(task, self._obs).shape[-1]
         extra = relabeller.size if relabeller else 0
         self.replay = Replay(seeds, size, len(planning.low), config.capacity, 1, extra)
@@ -162,7 +150,7 @@ class TwoLevel(Resumable):
         seen = planning.observe(task, self._obs)
         middle = planning.direction(task, self._obs)
         action = self._choose(self._split(seen), self._split(middle) if middle.ndim else middle)
-        obs = task.set_subgoal(planning.subgoal(self._join(action)))
+        obs = task.set_subgoal(planning.subgoal(action.reshape(task.num, -1)))
         last: dict[str, Any] = {}
         segment, reward, self._obs, over = rollout(
             task, self.low, obs, self.shape, explore=True, watch=last.update
@@ -185,17 +173,17 @@ class TwoLevel(Resumable):
         """The planner's action with noise, or a random one at first; (seeds, worlds, size)."""
         count = (self.config.worlds, len(self.planning.low))
         if self.steps < self.config.warm_up:
-            drawn = np.stack([g.uniform(-1.0, 1.0, count) for g in self._generators])
+            drawn = np.stack([g.uniform(-1.0, 1.0, count) for g in self.streams])
             return np.clip(middle + drawn, -1.0, 1.0)
         noise, redraw, burst = self.config.exploration(self.steps)
         action = evaluate(self.planner.actor, seen)
-        for seed, g in enumerate(self._generators):
+        for seed, g in enumerate(self.streams):
             noisy = action[seed] + noise * g.standard_normal(count)
-            begins = (g.random(count[0]) < burst) & (self._burst[seed] == 0)
-            self._burst[seed, begins] = self.config.burst_segments
-            drawn = (g.random(count) < redraw) | (self._burst[seed] > 0)[:, None]
+            begins = (g.random(count[0]) < burst) & (self.burst[seed] == 0)
+            self.burst[seed, begins] = self.config.burst_segments
+            drawn = (g.random(count) < redraw) | (self.burst[seed] > 0)[:, None]
             action[seed] = np.where(drawn, g.uniform(-1.0, 1.0, count), noisy)
-        self._burst -= self._burst > 0
+        self.burst -= self.burst > 0
         return np.clip(action, -1.0, 1.0)
 
     def _learn(self, before: int) -> None:
@@ -211,93 +199,22 @@ class TwoLevel(Resumable):
     def _split(self, array: Array) -> Array:
         return array.reshape(*self.shape, *array.shape[1:])
 
-    def _join(self, array: Array) -> Array:
-        return array.reshape(-1, *array.shape[2:])
-
     def actors(self) -> dict[str, nn.Module]:
         """The networks that act: "planner" and, where it has one, "low"."""
-        low = self.low
-        actor = low.agent.actor if isinstance(low, CriticLow) else getattr(low, "actor", None)
-        return {"planner": self.planner.actor} | ({} if actor is None else {"low": actor})
+        low = self.low.actor
+        return {"planner": self.planner.actor} | ({} if low is None else {"low": low})
 
     def state(self) -> State:
         """Both levels, memory, physics, random streams."""
+        arrays, record = super().state()
         world = self.task.snapshot()
-        record: dict[str, Any] = {
-            "steps": self.steps,
-            "streams": world.pop("streams"),
-            "noise": streams(self._generators),
-            "relabeller": self.relabeller.state() if self.relabeller else None,
-        }
-        arrays = {**within("task/", world), "burst": self._burst}
-        levels = (self.planner.state(), self.replay.state(), self.low.state())
-        for name, (found, kept) in zip(("planner", "replay", "low"), levels, strict=True):
-            arrays |= within(f"{name}/", found)
-            record[name] = kept
-        return arrays, record
+        record["worlds"] = world.pop("streams")
+        return {**{f"task/{name}": value for name, value in world.items()}, **arrays}, record
 
     def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
         """Continue from `state`."""
-        self.planner.restore(under(arrays, "planner/"), record["planner"])
-        self.replay.restore(under(arrays, "replay/"), record["replay"])
-        self.low.restore(under(arrays, "low/"), record["low"])
-        self._obs = self.task.restore({**under(arrays, "task/"), "streams": record["streams"]})
-        set_streams(self._generators, record["noise"])
-        if self.relabeller:
-            self.relabeller.restore(record["relabeller"])
-        self._burst[:] = arrays["burst"]
-        self.steps = int(record["steps"])
-
-
-def low_fields(task: PandaTask) -> tuple[str, ...]:
-    """Observation fields that the low level of a task sees."""
-    return JOINT_STATE if task.config.command == "joint" else CRITIC
-
-
-def rollout(
-    task: PandaTask,
-    low: LowLevel,
-    obs: Array,
-    shape: tuple[int, int],
-    explore: bool,
-    watch: Callable[[dict[str, Any]], object] | None = None,
-) -> tuple[Segment, Array, Array, bool]:
-    """Run the low level until the next sub-goal is due.
-
-    Args:
-        task: with its sub-goals just set, and `obs` observed after that.
-        low: the low level.
-        obs: (worlds, size).
-        shape: (seeds, worlds of each).
-        explore: whether the low level explores.
-        watch: called after each tick with `info`, the observation and the reward.
-
-    Returns:
-        The segment, mean rewards (seeds, worlds), the last observations, whether time is up.
-    """
-    views, actions, forces = [], [], []
-    terms: dict[str, list[Array]] = {}
-    total = np.zeros(task.num)
-    over = False
-    fields = low_fields(task)
-    seen = task.select(obs, fields).reshape(*shape, -1)
-    views.append(seen)
-    for _ in range(task.config.horizon):
-        action = low.act(seen, explore)
-        obs, reward, _, truncated, info = task.step(action.reshape(task.num, -1))
-        total += reward
-        seen = task.select(obs, fields).reshape(*shape, -1)
-        views.append(seen)
-        actions.append(action)
-        forces.append(info["contact_force_max"].reshape(shape))
-        for name, value in info["tracking_terms"].items():
-            terms.setdefault(name, []).append(value.reshape(shape))
-        over = bool(truncated[0])
-        if watch is not None:
-            watch({**info, "observation": obs, "reward": reward})
-    tracking = {name: np.stack(values) for name, values in terms.items()}
-    segment = Segment(np.stack(views), np.stack(actions), tracking, np.stack(forces))
-    return segment, (total / task.config.horizon).reshape(shape), obs, over
+        super().restore(arrays, record)
+        self._obs = self.task.restore({**under(arrays, "task/"), "streams": record["worlds"]})
 
 
 def play(

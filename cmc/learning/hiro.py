@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from cmc.learning.low_level import CriticLow, Segment
-from cmc.learning.state import set_streams, streams
+from cmc.learning.state import Kept
 from cmc.learning.td3 import TD3, Batch
 from cmc.policies import StackedMLP, tanh
 
@@ -36,20 +35,13 @@ CANDIDATES = 10
 
 @dataclass(frozen=True)
 class JointUnits:
-    """What brings (joints, joint velocity, joint error) to order one; n joints.
+    """What brings (joints, joint velocity, joint error) to order one; arrays are (n,), rad."""
 
-    Attributes:
-        start: joint angles at the start, (n,), rad.
-        half: half-range of the planner's increments, (n,), rad.
-        low, high: joint angles that sub-goals are clamped to, (n,), rad.
-        speed: joint velocity that counts as 1, rad/s (our choice).
-    """
-
-    start: Array
-    half: Array
-    low: Array
+    start: Array  # joint angles at the start
+    half: Array  # half-range of the planner's increments
+    low: Array  # ends that sub-goals are clamped to
     high: Array
-    speed: float = 0.2
+    speed: float = 0.2  # joint velocity that counts as 1, rad/s (our choice)
 
     def normalise(self, observation: Array) -> Array:
         """(..., 3n) in rad and rad/s to the units of this module."""
@@ -67,13 +59,9 @@ def subgoal_transition(goal: Tensor, state: Tensor, following: Tensor) -> Tensor
 def candidates(goal: Tensor, moved: Tensor, noise: Tensor) -> Tensor:
     """Sub-goals that may replace `goal`: itself, the motion, and draws around the motion.
 
-    Args:
-        goal: as it was set, (..., n).
-        moved: s_T - s_0, the motion that followed, (..., n).
-        noise: standard normal, (..., k, n); times half of the half-range.
-
-    Returns:
-        (..., k + 2, n), all but the first clipped to the planner's range [-1, 1].
+    `goal` (..., n) was set, `moved` is s_T - s_0 (..., n), and `noise` (..., k, n) is standard
+    normal, taken times half of the half-range. Of the (..., k + 2, n) that are returned all but the
+    first are clipped to the planner's range [-1, 1].
     """
     drawn = torch.cat([moved[..., None, :], moved[..., None, :] + 0.5 * noise], dim=-2)
     return torch.cat([goal[..., None, :], drawn.clamp(-1.0, 1.0)], dim=-2)
@@ -92,16 +80,10 @@ def log_likelihood(
 
     The standard deviation is 1 and the constant is left out: neither changes which is largest.
 
-    Args:
-        actor: maps (s, velocity, g), (seeds, batch, 3n), to actions (seeds, batch, n).
-        states: s_t, (seeds, batch, T, n); the first one is where the sub-goal was set.
-        speeds: (seeds, batch, T, n).
-        actions: (seeds, batch, T, n).
-        goals: at t = 0, (seeds, batch, k, n).
-        reach: ends of the range that targets s_0 + g are clamped to, (n,) each.
-
-    Returns:
-        (seeds, batch, k).
+    The actor maps (s, velocity, g), (seeds, batch, 3n), to actions (seeds, batch, n). States,
+    speeds and actions are (seeds, batch, T, n), the first state where the sub-goal was set; goals
+    at t = 0 are (seeds, batch, k, n). Targets s_0 + g are clamped to `reach`, (n,) each. Returns
+    (seeds, batch, k).
     """
     start = states[..., None, :1, :]  # (seeds, batch, 1, 1, n)
     first = (start + goals[..., None, :]).clamp(*reach) - start
@@ -145,11 +127,8 @@ class JointLow(CriticLow):
     Actions are stored as they act, with the sign that the task forces on them, so that likelihoods
     compare torques.
 
-    Args:
-        agent: a `PullActor` and critics on normalised observations.
-        seeds: one integer for each seed.
-        units: normalisation.
-        noise: standard deviation of the exploration noise, in units of the largest torque.
+    `agent` is a `PullActor` with critics on normalised observations; `noise` is the deviation of
+    the exploration noise, in units of the largest torque.
     """
 
     def __init__(self, agent: TD3, seeds: Sequence[int], units: JointUnits, noise: float) -> None:
@@ -169,7 +148,7 @@ class JointLow(CriticLow):
         super().record(replace(segment, observation=seen))
 
 
-class OffPolicyCorrection:
+class OffPolicyCorrection(Kept):
     """Stores whole segments with the planner's transitions and relabels what is drawn.
 
     Args:
@@ -178,6 +157,8 @@ class OffPolicyCorrection:
         horizon: ticks T of a segment.
         stride: ticks between those whose likelihood counts (1: all, as in the source).
     """
+
+    kept = ("streams",)
 
     def __init__(self, low: JointLow, seeds: Sequence[int], horizon: int, stride: int = 1) -> None:
         if not 1 <= stride <= horizon:
@@ -188,7 +169,7 @@ class OffPolicyCorrection:
         self.size = (3 * horizon + 1) * self.n
         ends = [(end - units.start) / units.half for end in (units.low, units.high)]
         self._reach = (_tensor(ends[0]), _tensor(ends[1]))
-        self._generators = [np.random.default_rng([seed, 4, 17]) for seed in seeds]
+        self.streams = [np.random.default_rng([seed, 4, 17]) for seed in seeds]
 
     def pack(self, segment: Segment) -> Array:
         """States, velocities and actions of the segment and its last state, (seeds, N, size)."""
@@ -209,19 +190,11 @@ class OffPolicyCorrection:
         rows = batch.extra[..., : -self.n].unflatten(-1, (self.horizon, 3 * self.n))
         moved = batch.extra[..., -self.n :] - rows[..., 0, : self.n]
         shape = (moved.shape[1], CANDIDATES - 2, self.n)
-        noise = np.stack([g.standard_normal(shape, dtype=np.float32) for g in self._generators])
+        noise = np.stack([g.standard_normal(shape, dtype=np.float32) for g in self.streams])
         goals = candidates(batch.action, moved, torch.from_numpy(noise))
         states, speeds, actions = rows[..., :: self.stride, :].chunk(3, dim=-1)
         actor = self.low.agent.actor
         return goals, log_likelihood(actor, states, speeds, actions, goals, self._reach)
-
-    def state(self) -> list[Any]:
-        """The random streams."""
-        return streams(self._generators)
-
-    def restore(self, state: list[Any]) -> None:
-        """Continue from `state`."""
-        set_streams(self._generators, state)
 
 
 def _tensor(value: Array) -> Tensor:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,8 +21,8 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from torch import Tensor, nn
 
-from cmc.learning.low_level import Segment, evaluate
-from cmc.learning.state import Arrays, State, learned, relearn, set_streams, streams
+from cmc.learning.low_level import LowLevel, Segment
+from cmc.learning.state import Learners
 
 Array = NDArray[np.float64]
 
@@ -33,76 +32,47 @@ class LatentConfig:
     """Loss and optimizer of the latent rollout (all our choice).
 
     Attributes:
-        rate: Adam step.
-        batch: segments of each seed in one update.
-        blocked: share of the translation axes that are blocked in a rollout.
-        force_limit: pressing force that costs nothing, N.
-        force_weight: cost of each newton beyond it, in units of the tracking loss.
-        effort_weight: cost of u^2 in free motion.
-        disturbance: largest constant push of a rollout on each axis, in units of an action.
         cap: what (K_d + g K2) dt is kept below by construction: below 1 an error does not change
             sides from tick to tick, which in contact is felt well before chatter starts at 2.
-        memory: segment starts kept for each seed.
-        rotation_scale: radians that count as much as one meter of translation error.
     """
 
-    rate: float = 2e-3
-    batch: int = 64
-    blocked: float = 0.2
-    force_limit: float = 1.0
-    force_weight: float = 0.2
-    effort_weight: float = 0.0
-    disturbance: float = 0.25
+    rate: float = 2e-3  # Adam's
+    batch: int = 64  # segments of each seed in one update
+    blocked: float = 0.2  # share of the translation axes that are blocked in a rollout
+    force_limit: float = 1.0  # pressing force that costs nothing, N
+    force_weight: float = 0.2  # cost of each newton beyond it, in units of the tracking loss
+    effort_weight: float = 0.0  # cost of u^2 in free motion
+    disturbance: float = 0.25  # largest constant push on each axis, in units of an action
     cap: float = 1.0
-    memory: int = 4096
-    rotation_scale: float = 100.0
+    memory: int = 4096  # segment starts kept for each seed
+    rotation_scale: float = 100.0  # radians that count as much as one meter of error
 
 
 @dataclass(frozen=True)
 class LatentModel:
-    """The known model of one axis each; every array is (n,) unless said otherwise.
+    """The known model of one axis each; every array is (n,)."""
 
-    Attributes:
-        K_p, K_d: controller gains.
-        K1, K2: composite gains.
-        action: what an action of 1 commands (m/s^2 or rad/s^2).
-        mass: effective mass that presses where an axis is blocked, kg; 0 where it never is.
-        integrates: 1 where the integral acts, 0 elsewhere.
-        tick: control period, s.
-        delay: ticks by which actions come late.
-    """
-
-    K_p: Array
+    K_p: Array  # controller gains
     K_d: Array
-    K1: Array
+    K1: Array  # composite gains
     K2: Array
-    action: Array
-    mass: Array
-    integrates: Array
-    tick: float
-    delay: int = 0
+    action: Array  # what an action of 1 commands, m/s^2 or rad/s^2
+    mass: Array  # effective mass that presses where an axis is blocked, kg; 0 where it never is
+    integrates: Array  # 1 where the integral acts, 0 elsewhere
+    tick: float  # control period, s
+    delay: int = 0  # ticks by which actions come late
 
     def transition(self) -> tuple[Array, Array]:
         """Exact step of (e, e') under a held action in [-1, 1]: (n, 2, 2) and (n, 2)."""
-        n = len(self.K_p)
-        motion, push = np.zeros((n, 2, 2)), np.zeros((n, 2))
-        for k in range(n):
-            full = np.zeros((3, 3))
-            full[0, 1] = 1.0
-            full[1] = -self.K_p[k], -self.K_d[k], -self.action[k]  # 2nd_sys
-            step = expm(full * self.tick)
-            motion[k], push[k] = step[:2, :2], step[:2, 2]
-        return motion, push
+        full = np.zeros((len(self.K_p), 3, 3))
+        full[:, 0, 1] = 1.0
+        full[:, 1] = -np.stack([self.K_p, self.K_d, self.action], axis=-1)  # 2nd_sys
+        step = np.array([expm(matrix * self.tick) for matrix in full])
+        return step[:, :2, :2], step[:, :2, 2]
 
 
 class Rollouts:
-    """Segments of the latent model under an actor, and what they cost.
-
-    Args:
-        model: the latent model of n axes.
-        horizon: ticks of a segment.
-        config: the loss.
-    """
+    """Segments of the latent model of n axes under an actor, `horizon` ticks, and their cost."""
 
     def __init__(self, model: LatentModel, horizon: int, config: LatentConfig) -> None:
         self.model, self.horizon, self.config = model, horizon, config
@@ -121,11 +91,9 @@ class Rollouts:
     def cost(self, actor: nn.Module, starts: Tensor, blocked: Tensor, pushes: Tensor) -> Tensor:
         """Mean cost of rollouts, (seeds,).
 
-        Args:
-            actor: maps (y, integral of y), (seeds, batch, 2n), to actions in [-1, 1].
-            starts: (e, e') of each segment, (seeds, batch, 2n).
-            blocked: axes that cannot move, (seeds, batch, n).
-            pushes: constant disturbance of each axis in units of an action, (seeds, batch, n).
+        The actor maps (y, integral of y), (seeds, batch, 2n), to actions in [-1, 1]; segments
+        start at (e, e'), (seeds, batch, 2n). By axis, (seeds, batch, n), `blocked` says which
+        cannot move, and `pushes` are constant disturbances in units of an action.
         """
         c, config = self._constants, self.config
         e, v = starts.chunk(2, dim=-1)
@@ -152,16 +120,13 @@ class Rollouts:
         return cost.mean(-1) / self.horizon
 
 
-class LatentLow:
+class LatentLow(LowLevel):
     """Learns an actor through the latent model, from the segment starts it has seen.
 
-    Args:
-        actor: maps (y, integral of y) to actions in [-1, 1].
-        seeds: one integer for each seed.
-        model: the latent model.
-        horizon: ticks of a segment.
-        config: loss and optimizer.
+    The actor maps (y, integral of y) to actions in [-1, 1]; the model is known: none is explored.
     """
+
+    kept = ("starts", "written", "streams")
 
     def __init__(
         self,
@@ -171,35 +136,31 @@ class LatentLow:
         horizon: int,
         config: LatentConfig,
     ) -> None:
-        self.actor, self.model, self.horizon, self.config = actor, model, horizon, config
+        super().__init__(actor, len(model.K_p))
+        self.model, self.config = model, config
         self.rollouts = Rollouts(model, horizon, config)
         self.adam = torch.optim.Adam(actor.parameters(), config.rate, foreach=True)
-        self._n = len(model.K_p)
-        self._starts = np.zeros((len(seeds), config.memory, 2 * self._n), dtype=np.float32)
-        self._written = 0
-        self._generators = [np.random.default_rng([seed, 3, 17]) for seed in seeds]
-
-    def act(self, observation: Array, explore: bool) -> Array:
-        """See `LowLevel.act`; nothing is explored, since the model is known."""
-        return evaluate(self.actor, observation)
+        self.starts = np.zeros((len(seeds), config.memory, 2 * self.n), dtype=np.float32)
+        self.written = 0
+        self.streams = [np.random.default_rng([seed, 3, 17]) for seed in seeds]
 
     def record(self, segment: Segment) -> None:
         """Keep the error and velocity with which each segment starts."""
-        n = self._n
+        n = self.n
         starts = segment.observation[0][..., 2 * n : 4 * n].copy()  # error, velocity of the tip
         starts[..., n:] *= -1.0  # the sub-goal is at rest: e' = -velocity
-        where = (self._written + np.arange(starts.shape[1])) % self.config.memory
-        self._starts[:, where] = starts
-        self._written += starts.shape[1]
+        where = (self.written + np.arange(starts.shape[1])) % self.config.memory
+        self.starts[:, where] = starts
+        self.written += starts.shape[1]
 
     def update(self) -> None:
         """One Adam step on the cost of a batch of rollouts."""
-        known, batch = min(self._written, self.config.memory), self.config.batch
+        known, batch = min(self.written, self.config.memory), self.config.batch
         if not known:
             return
-        drawn = np.stack([g.integers(known, size=batch) for g in self._generators])
-        starts = torch.from_numpy(self._starts[np.arange(len(drawn))[:, None], drawn])
-        self.learn(starts, *self.rollouts.draw(self._generators, batch))
+        drawn = np.stack([g.integers(known, size=batch) for g in self.streams])
+        starts = torch.from_numpy(self.starts[np.arange(len(drawn))[:, None], drawn])
+        self.learn(starts, *self.rollouts.draw(self.streams, batch))
 
     def learn(self, starts: Tensor, blocked: Tensor, pushes: Tensor) -> Tensor:
         """One Adam step on the cost of given rollouts, which it returns, (seeds,)."""
@@ -209,18 +170,9 @@ class LatentLow:
         self.adam.step()
         return cost.detach()
 
-    def state(self) -> State:
-        """Actor, Adam, starts, random streams."""
-        arrays = learned(dict(self.actor.named_parameters()), self.adam)
-        arrays["starts"] = self._starts.copy()
-        return arrays, {"written": self._written, "noise": streams(self._generators)}
-
-    def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
-        """Continue from `state`."""
-        relearn(arrays, dict(self.actor.named_parameters()), self.adam)
-        self._starts[:] = arrays["starts"]
-        self._written = int(record["written"])
-        set_streams(self._generators, record["noise"])
+    def learners(self) -> Learners:
+        """The actor and its Adam."""
+        return [(dict(self.actor.named_parameters()), self.adam)]
 
 
 def _tensor(value: Array) -> Tensor:

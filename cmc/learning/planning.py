@@ -1,18 +1,24 @@
-"""How a task looks to a planner, and to its critics: normalized observations and sub-goals."""
+"""How a task looks to a planner and to its critics, and PPO as a planner without a low level."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
+from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from cmc.envs.panda_task import PandaTask
+from cmc.learning.low_level import LowLevel, rollout
+from cmc.learning.ppo import PPO, PPOConfig
 
 Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -63,19 +69,14 @@ class CriticView:
     twentieth of a unit and a tanh layer hardly tells it from zero. The critics alone (they are not
     needed once the planner is trained) also see tip and asked sub-goal relative to the goal, as
     they are and through tanh at two scales, and their smoothed lengths n(v, c) = sqrt(v.v + c^2).
-
-    Args:
-        task: gives sizes, and whether sub-goals are increments.
-        planning: normalization; sub-goals are positions (3,), m, or poses (6,), m and rad.
+    Sub-goals are positions (3,), m, or poses (6,), m and rad.
     """
 
     def __init__(self, task: PandaTask, planning: Planning) -> None:
-        names, start = planning.fields or task.high_level, 0
-        self._parts: dict[str, slice] = {}
-        for name in names:
-            size = task.layout[name].stop - task.layout[name].start
-            self._parts[name] = slice(start, start + size)
-            start += size
+        names = planning.fields or task.high_level
+        ends = np.cumsum([task.layout[name].stop - task.layout[name].start for name in names])
+        starts = [0, *ends[:-1]]
+        self._parts = {k: slice(a, b) for k, a, b in zip(names, starts, ends, strict=True)}
         shift = {k: np.broadcast_to(planning.shift[k], 3) for k in ("position", "goal")}
         unit = {k: 1e3 / np.broadcast_to(planning.scale[k], 3) for k in ("position", "goal")}
         middle, half = 0.5 * (planning.low + planning.high), 0.5 * (planning.high - planning.low)
@@ -110,3 +111,87 @@ def _norm(v: Tensor, c: float) -> Tensor:
 
 def _tensor(value: np.ndarray) -> Tensor:
     return torch.as_tensor(np.asarray(value), dtype=torch.float32)
+
+
+class SegmentEnv(VectorEnv[Array32, Array32, NDArray[Any]]):
+    """The worlds of a task as a planner without a low level sees it; a step is a segment, u = 0.
+
+    Observations are normalized, actions are sub-goals in [-1, 1] (others are clipped), rewards are
+    means over the segment times `reward_scale`. Episodes are truncated by their time limit, and
+    reset from outside only.
+    """
+
+    def __init__(self, task: PandaTask, planning: Planning, reward_scale: float = 1.0) -> None:
+        self.task, self.planning, self.reward_scale = task, planning, reward_scale
+        self.num_envs = task.num
+        size, ends = planning.observe(task, task.reset()).shape[-1], len(planning.low)
+        self.single_observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (ends,), np.float32)
+        self.idle = LowLevel(None, task.config.low_size)
+        self.success = np.zeros(task.num)  # at the last tick of the latest segment
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Array32, dict[str, Any]]:
+        """Start all episodes anew; `seed` is one integer for each equal group of worlds."""
+        if seed is not None:
+            seeds = np.atleast_1d(seed)
+            if self.num_envs % len(seeds):
+                raise ValueError(
+                    f"wanted seeds that divide {self.num_envs} worlds equally, got {len(seeds)}"
+                )
+            each = self.num_envs // len(seeds)
+            self.task.seed([int(s) + k for s in seeds for k in range(each)])
+        return self._seen(self.task.reset()), {}
+
+    def step(self, actions: Array32) -> tuple[Array32, Any, Any, Any, dict[str, Any]]:
+        """One segment of every world."""
+        aim = self.planning.subgoal(np.clip(actions.astype(np.float64), -1.0, 1.0))
+        obs = self.task.set_subgoal(aim)
+        last: dict[str, Any] = {}
+        shape = (1, self.num_envs)
+        _, reward, obs, over = rollout(self.task, self.idle, obs, shape, False, last.update)
+        self.success[:] = last["success"]
+        gain = self.reward_scale * reward[0]
+        ended, limit = np.zeros(self.num_envs, bool), np.full(self.num_envs, over)
+        return self._seen(obs), gain, ended, limit, {}
+
+    def _seen(self, obs: Array) -> Array32:
+        return self.planning.observe(self.task, obs).astype(np.float32)
+
+
+class OneLevelPPO(PPO):
+    """PPO on `SegmentEnv`, with the face of a two-level training; an update is whole episodes."""
+
+    env: SegmentEnv
+
+    def __init__(
+        self, env: SegmentEnv, actor: nn.Module, seeds: Sequence[int], config: PPOConfig
+    ) -> None:
+        super().__init__(env, actor, seeds, config)
+        self.low, self.each = env.idle, env.num_envs // len(seeds)
+
+    @property
+    def stride(self) -> int:
+        """Environment steps of each seed in an update."""
+        return self.config.steps * self.env.task.config.horizon * self.each
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of each seed so far."""
+        return self.updates * self.stride
+
+    @property
+    def success(self) -> Array:
+        """Share of each seed's last episodes that were solved at their end, (seeds,)."""
+        return self.env.success.reshape(len(self.seeds), -1).mean(1)
+
+    def segment(self) -> Array:
+        """One update, of at least two segments for each minibatch; mean rewards (seeds,)."""
+        size, parts = self.config.steps * self.each, self.config.minibatches
+        if size < 2 * parts:
+            raise ValueError(f"wanted two segments for each of {parts} minibatches, got {size}")
+        total = self.update()["episode_return"]
+        return np.asarray(total / (self.config.steps * self.env.reward_scale), dtype=np.float64)
+
+    def actors(self) -> dict[str, nn.Module]:
+        """The network that acts, as "planner"."""
+        return {"planner": self.policy}

@@ -3,75 +3,55 @@
 The algorithm is the usual one (Schulman et al. 2017): clipped surrogate, generalised advantage
 estimation, time limits bootstrapped. Everything carries a leading axis of seeds S, and no operation
 mixes seeds: advantages are normalised, gradients are clipped and minibatches are drawn a seed at a
-time, so a seed learns the same alone and in a batch.
+time, so a seed learns the same alone and in a batch. PPO and C-PPO differ in the policy that is
+passed in, and in nothing else.
 
-PPO and C-PPO differ in the policy that is passed in, and in nothing else.
-
-An update starts by resetting the environment with integers derived from (seed, update). The whole
-state of a training is therefore its weights, Adam's moments and the number of updates done: a
-training that is killed and resumed ends with the weights of one that was not.
+An update starts by resetting the environment with integers derived from (seed, update). The state
+of a training is therefore its weights, Adam's moments and the number of updates done, and one that
+is killed and resumed ends with the weights of one that was not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from gymnasium.vector import VectorEnv
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from cmc.learning.rollout import Rollout, collect
-from cmc.learning.state import Arrays, Resumable, State, learned, relearn, single_thread
-from cmc.policies import StackedMLP
-
-Callback = Callable[[dict[str, Any]], object]
+from cmc.learning.state import Learners, Resumable, single_thread
+from cmc.policies import StackedMLP, as_numpy
 
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """Hyperparameters. The paper gives none: all are our choice.
+    """Hyperparameters. The paper gives none: all are our choice."""
 
-    Attributes:
-        steps: environment steps of each trajectory in an update; a multiple of the episode length.
-        epochs: passes over the data of an update.
-        minibatches: minibatches a pass.
-        learning_rate: Adam's step size.
-        gamma: discount factor.
-        gae_lambda: lambda of the generalised advantage estimate.
-        clip: half-width of the interval to which the probability ratio is clipped.
-        value_weight: weight of the critic's squared error in the loss.
-        max_norm: largest norm of a seed's gradient.
-        log_std_start, log_std_floor: first and smallest logarithm of the noise's deviation.
-        critic_hidden: hidden layers of the critic.
-    """
-
-    steps: int = 50
-    epochs: int = 4
-    minibatches: int = 4
-    learning_rate: float = 2e-3
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    clip: float = 0.2
-    value_weight: float = 0.5
-    max_norm: float = 0.5
-    log_std_start: float = -1.0
-    log_std_floor: float = -4.0
+    steps: int = 50  # of each trajectory in an update; a multiple of the episode length
+    epochs: int = 4  # passes over the data of an update
+    minibatches: int = 4  # a pass
+    learning_rate: float = 2e-3  # Adam's
+    gamma: float = 0.99  # discount
+    gae_lambda: float = 0.95  # lambda of the generalised advantage estimate
+    clip: float = 0.2  # half-width of the interval that the probability ratio is clipped to
+    value_weight: float = 0.5  # of the critic's squared error in the loss
+    max_norm: float = 0.5  # of a seed's gradient
+    log_std_start: float = -1.0  # logarithm of the noise's deviation, at first
+    log_std_floor: float = -4.0  # and its least
     critic_hidden: tuple[int, ...] = (64, 64)
 
     def __post_init__(self) -> None:
-        for name in ("steps", "epochs", "minibatches"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}: wanted at least 1, got {getattr(self, name)}")
-        for name in ("learning_rate", "clip", "max_norm"):
-            if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name}: wanted a positive number, got {getattr(self, name)}")
-        for name in ("gamma", "gae_lambda"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name}: wanted a number in [0, 1], got {getattr(self, name)}")
+        for name, value in vars(self).items():
+            if name in ("steps", "epochs", "minibatches") and value < 1:
+                raise ValueError(f"{name}: wanted at least 1, got {value}")
+            if name in ("learning_rate", "clip", "max_norm") and not 0 < value < np.inf:
+                raise ValueError(f"{name}: wanted a positive number, got {value}")
+            if name in ("gamma", "gae_lambda") and not 0 <= value <= 1:
+                raise ValueError(f"{name}: wanted a number in [0, 1], got {value}")
 
 
 class PPO(Resumable):
@@ -85,11 +65,9 @@ class PPO(Resumable):
             the same seeds.
         seeds: one non-negative integer for each seed.
         config: hyperparameters.
-
-    Raises:
-        ValueError: if there is no seed, the trajectories cannot be shared out equally, or the
-            policy has other seeds or sizes.
     """
+
+    kept = ("updates",)
 
     def __init__(
         self,
@@ -121,7 +99,6 @@ class PPO(Resumable):
             self.parameters.values(), lr=self.config.learning_rate, eps=1e-5, fused=True
         )
         self.updates = 0
-        """Updates done."""
 
     @property
     def episodes(self) -> int:
@@ -132,21 +109,14 @@ class PPO(Resumable):
     def update(self) -> dict[str, Any]:
         """Collect one batch of trajectories, learn from it, and report.
 
-        Returns:
-            `update`, `episodes` and `steps` (of each seed, so far), and by seed (S,) arrays:
-            `episode_return` (sum of rewards over `config.steps` steps, mean over trajectories),
-            `value_loss`, `clip_fraction`, `std` (S, n).
+        The report holds `update`, `episodes` and `steps` (of each seed, so far), and by seed (S,)
+        `episode_return` (sum of rewards over `config.steps` steps, mean over trajectories),
+        `value_loss`, `clip_fraction`, and `std` (S, n).
         """
         c = self.config
         generators = [np.random.default_rng([seed, self.updates]) for seed in self.seeds]
-        rollout = collect(
-            self.env,
-            self.policy,
-            self.log_std.detach(),
-            self._environment_seeds(self.updates),
-            generators,
-            c.steps,
-        )
+        begin, spread = self._environment_seeds(self.updates), self.log_std.detach()
+        rollout = collect(self.env, self.policy, spread, begin, generators, c.steps)
         data = self._learning_data(rollout)
         report: dict[str, Tensor] = {}
         for _ in range(c.epochs):
@@ -154,11 +124,10 @@ class PPO(Resumable):
             for batch in torch.tensor_split(shuffled, c.minibatches, dim=1):
                 report = self._minibatch(batch)
         self.updates += 1
-        steps = c.steps * self.episodes
         return {
             "update": self.updates,
             "episodes": self.episodes,
-            "steps": steps,
+            "steps": c.steps * self.episodes,
             "episode_return": rollout.reward.sum(1).mean(1),
             "std": self.log_std.detach().exp()[:, 0].numpy(),
             "value_loss": report["value_error"].square().mean(1).numpy(),
@@ -166,28 +135,13 @@ class PPO(Resumable):
         }
 
     def train(
-        self,
-        updates: int,
-        callback: Callback | None = None,
-        *,
-        checkpoint: str | Path | None = None,
-        every: int = 25,
-        record: Mapping[str, Any] | None = None,
+        self, updates: int, callback: Callable[[dict[str, Any]], object] | None = None
     ) -> None:
-        """Learn until `updates` updates are done; a given checkpoint is resumed and kept current.
+        """Learn until `updates` updates are done, and report each to `callback`.
 
         An interrupt (Ctrl-C, a stopped notebook cell) between or within updates returns to the last
-        whole update, writes the checkpoint and is raised again; calling `train` goes on from there.
-
-        Args:
-            updates: updates in all, those already done included.
-            callback: called with the report of each update.
-            checkpoint: file of the training's state; resumed from if it exists.
-            every: updates between two checkpoints.
-            record: JSON record for the checkpoint: at least `study` and `method`.
+        whole update and is raised again; calling `train` goes on from there.
         """
-        if checkpoint is not None and Path(checkpoint).is_file():
-            self.load(checkpoint, record)
         while self.updates < updates:
             before = self.state()
             try:
@@ -197,27 +151,16 @@ class PPO(Resumable):
             except KeyboardInterrupt:
                 if self.updates == before[1]["updates"]:
                     self.restore(*before)
-                if checkpoint is not None:
-                    self.save(checkpoint, record)
                 raise
-            if checkpoint is not None and (self.updates % every == 0 or self.updates == updates):
-                self.save(checkpoint, record)
 
-    def state(self) -> State:
-        """Weights, Adam, updates done."""
-        return learned(self.parameters, self.optimiser), {"updates": self.updates}
-
-    def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
-        """Continue from `state`."""
-        relearn(arrays, self.parameters, self.optimiser)
-        self.updates = int(record["updates"])
+    def learners(self) -> Learners:
+        """Policy, critic and noise."""
+        return [(self.parameters, self.optimiser)]
 
     def _environment_seeds(self, update: int) -> Any:
         """One integer for each seed, and a single one where there is a single seed."""
-        drawn = [
-            int(np.random.SeedSequence([seed, update, 1]).generate_state(1)[0])
-            for seed in self.seeds
-        ]
+        streams = [np.random.SeedSequence([seed, update, 1]) for seed in self.seeds]
+        drawn = [int(stream.generate_state(1)[0]) for stream in streams]
         return drawn if len(drawn) > 1 else drawn[0]
 
     @torch.no_grad()
@@ -230,9 +173,8 @@ class PPO(Resumable):
         advantage = generalised_advantage(rollout, value, following, c.gamma, c.gae_lambda)
         noise = rollout.noise
         log_probability = -(0.5 * noise * noise + self.log_std.unsqueeze(1)).sum(-1)
-        scalars = torch.stack(
-            [log_probability, torch.from_numpy(advantage), torch.from_numpy(advantage + value)], -1
-        )
+        both = (torch.from_numpy(part) for part in (advantage, advantage + value))
+        scalars = torch.stack([log_probability, *both], -1)
         parts = (rollout.observation, rollout.privileged, rollout.action, scalars)
         self._columns = [part.shape[-1] for part in parts]
         return torch.cat(parts, -1).flatten(1, 2)
@@ -265,20 +207,74 @@ class PPO(Resumable):
         return {"ratio": ratio, "value_error": error[..., 0]}
 
 
+class Rollout(NamedTuple):
+    """S seeds, T steps, E trajectories a seed; all arrays start with (S, T, E)."""
+
+    observation: Tensor  # what the policy saw
+    privileged: Tensor  # what the critic saw at the same time
+    following: Tensor  # what the critic sees at the state that was reached, before any restart
+    action: Tensor  # commands, noise included
+    noise: Tensor  # standard normal noise of the commands
+    reward: NDArray[np.float32]
+    terminated: NDArray[np.bool_]  # where the task ended: no value beyond
+    done: NDArray[np.bool_]  # where the trajectory ended, by the task or by a time limit
+
+
+def collect(
+    env: VectorEnv[Any, Any, Any],
+    policy: nn.Module,
+    log_std: Tensor,
+    env_seeds: Any,
+    generators: Sequence[np.random.Generator],
+    steps: int,
+) -> Rollout:
+    """Reset `env` and run the policy with Gaussian noise for `steps` steps.
+
+    `env` has S E trajectories, seed by seed, and `reset` takes `env_seeds`; the policy maps
+    (S, E, d) to (S, E, n), log_std is (S, 1, n), and each seed's noise has its generator.
+    """
+    S, n = len(generators), log_std.shape[-1]
+    E = env.num_envs // S
+    noise = np.stack([g.standard_normal((steps, E, n), dtype=np.float32) for g in generators])
+    kick = noise * log_std.exp().unsqueeze(1).numpy()
+    observation, info = env.reset(seed=env_seeds)
+    privileged = info.get("privileged", observation)
+    sizes = (observation.shape[-1], privileged.shape[-1], privileged.shape[-1], n)
+    floats = [np.empty((S, steps, E, size), dtype=np.float32) for size in sizes]
+    scalars = [np.empty((S, steps, E), dtype=kind) for kind in (np.float32, bool, bool)]
+    act = as_numpy(policy)
+    for t in range(steps):
+        seen = observation.reshape(S, E, -1)
+        action = act(seen) + kick[:, t]
+        floats[0][:, t], floats[1][:, t] = seen, privileged.reshape(S, E, -1)
+        observation, gain, end, limit, info = env.step(action.reshape(S * E, n))
+        privileged = info.get("privileged", observation)
+        reached = _before_restart(privileged, end | limit, info)
+        floats[2][:, t], floats[3][:, t] = reached.reshape(S, E, -1), action
+        for array, part in zip(scalars, (gain, end, end | limit), strict=True):
+            array[:, t] = part.reshape(S, E)
+    saw, knew, arrived, acted, kicked = (torch.from_numpy(array) for array in (*floats, noise))
+    return Rollout(saw, knew, arrived, acted, kicked, *scalars)
+
+
+def _before_restart(privileged: np.ndarray, done: np.ndarray, info: dict[str, Any]) -> np.ndarray:
+    """Critic's input at the states reached, where the environment has already restarted some."""
+    if not done.any() or "final_obs" not in info:
+        return privileged
+    final = info.get("final_info", {}).get("privileged", info["final_obs"])
+    if final.dtype == object:  # Gymnasium's general vector environments hold one array or None
+        final = np.stack([row if row is not None else privileged[0] for row in final])
+    return np.where(done[:, None], final, privileged)
+
+
 def generalised_advantage(
     rollout: Rollout, value: np.ndarray, following: np.ndarray, gamma: float, lam: float
 ) -> np.ndarray:
     """Generalised advantage estimate A_t = delta_t + gamma lambda A_t+1 (Schulman et al. 2016).
 
     delta_t = r_t + gamma V(next) - V(now), where V(next) is the critic at the state that was
-    reached, also where a time limit cut the episode, and 0 only where the task ended.
-
-    Args:
-        rollout: reward, terminated and done, (S, T, E) each.
-        value: critic at the states, (S, T, E).
-        following: critic at the states reached, before any restart, (S, T, E).
-        gamma: discount factor.
-        lam: lambda.
+    reached (`following`), also where a time limit cut the episode, and 0 only where the task ended.
+    All arrays are (S, T, E).
     """
     delta = rollout.reward + gamma * following * ~rollout.terminated - value
     carry = gamma * lam * ~rollout.done
@@ -303,16 +299,8 @@ def surrogate_gradient(
         dL/dlog p = -r A / m   where r A is the smaller of the two, and 0 where it is clipped,
         dlog p/dmean = x / std,   dlog p/dlog_std = x^2 - 1   with x = (action - mean) / std.
 
-    Args:
-        mean: (S, m, n).
-        log_std: (S, 1, n).
-        action: (S, m, n).
-        old_log_probability: (S, m), without the constant -n/2 log 2 pi.
-        advantage: A, (S, m).
-        clip: c.
-
-    Returns:
-        dL/dmean (S, m, n), dL/dlog_std (S, 1, n) and the ratio r (S, m).
+    Shapes: mean and action (S, m, n), log_std (S, 1, n), the rest (S, m); `old_log_probability` is
+    without its constant -n/2 log 2 pi. Returns dL/dmean, dL/dlog_std and the ratio r (S, m).
     """
     precision = torch.exp(-log_std)
     x = (action - mean) * precision

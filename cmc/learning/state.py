@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -24,9 +24,61 @@ from cmc import store
 Arrays = dict[str, np.ndarray]
 State = tuple[Arrays, dict[str, Any]]
 """Arrays by name, and what JSON can hold."""
+Learners = list[tuple[Mapping[str, nn.Parameter], torch.optim.Optimizer | None]]
+"""Weights by name, and their Adam if they have one."""
 
 
-class Resumable:
+class Kept:
+    """Something whose state goes into a file.
+
+    Attributes:
+        kept: names of attributes that decide what follows: numbers, arrays, lists of random
+            generators (None, "numbers"), and parts that are `Kept` themselves.
+    """
+
+    kept: tuple[str, ...] = ()
+
+    def learners(self) -> Learners:
+        """Networks that decide what follows."""
+        return []
+
+    def state(self) -> State:
+        """Everything that decides what follows."""
+        arrays: Arrays = {}
+        record: dict[str, Any] = {}
+        for parameters, adam in self.learners():
+            arrays |= learned(parameters, adam)
+        for name in self.kept:
+            value = getattr(self, name)
+            if isinstance(value, Kept):
+                found, record[name] = value.state()
+                arrays |= {f"{name}/{key}": array for key, array in found.items()}
+            elif isinstance(value, np.ndarray):
+                arrays[name] = value.copy()
+            elif isinstance(value, list):
+                record[name] = [generator.bit_generator.state for generator in value]
+            else:
+                record[name] = value
+        return arrays, record
+
+    def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
+        """Continue from `state`."""
+        for parameters, adam in self.learners():
+            relearn(arrays, parameters, adam)
+        for name in self.kept:
+            value = getattr(self, name)
+            if isinstance(value, Kept):
+                value.restore(under(arrays, f"{name}/"), record[name])
+            elif isinstance(value, np.ndarray):
+                value[:] = arrays[name]
+            elif isinstance(value, list):
+                for generator, stands in zip(value, record[name], strict=True):
+                    generator.bit_generator.state = stands
+            else:
+                setattr(self, name, record[name])
+
+
+class Resumable(Kept):
     """A training that can be written to a file and go on from it.
 
     Attributes:
@@ -37,20 +89,10 @@ class Resumable:
     seeds: tuple[int, ...]
     config: Any
 
-    def state(self) -> State:
-        """Everything that decides what follows."""
-        raise NotImplementedError
-
-    def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
-        """Continue from `state`."""
-        raise NotImplementedError
-
     def save(self, path: str | Path, record: Mapping[str, Any] | None = None) -> None:
         """Write the state as one safetensors file, atomically.
 
-        Args:
-            path: the file.
-            record: JSON record: `study` and `method`, and what else a file must agree with.
+        `record` holds `study` and `method`, and what else a file must agree with.
         """
         arrays, state = self.state()
         made = {"study": "none", "method": "none", **(record or {}), "seeds": list(self.seeds)}
@@ -96,11 +138,7 @@ def relearn(
     parameters: Mapping[str, nn.Parameter],
     adam: torch.optim.Optimizer | None,
 ) -> None:
-    """Put back what `learned` took.
-
-    Raises:
-        CheckpointError: if a weight is missing or has another shape.
-    """
+    """Put back what `learned` took, once all of it is found to fit."""
     for name, parameter in parameters.items():
         found = arrays.get(name)
         if found is None or found.shape != tuple(parameter.shape):
@@ -112,27 +150,10 @@ def relearn(
         parameter.copy_(torch.from_numpy(arrays[name]))
         if adam is not None:
             adam.state.pop(parameter, None)
-            slots = under(arrays, f"{name}/")
-            if slots:  # files hold no scalars: a step count has come back as (1,)
-                shapes = {key: () if key == "step" else parameter.shape for key in slots}
-                moments = {key: torch.tensor(value) for key, value in slots.items()}
-                adam.state[parameter] = {k: v.reshape(shapes[k]) for k, v in moments.items()}
-
-
-def streams(generators: Sequence[np.random.Generator]) -> list[Any]:
-    """Where random streams stand."""
-    return [generator.bit_generator.state for generator in generators]
-
-
-def set_streams(generators: Sequence[np.random.Generator], states: Sequence[Any]) -> None:
-    """Put random streams back where they stood."""
-    for generator, state in zip(generators, states, strict=True):
-        generator.bit_generator.state = state
-
-
-def within(start: str, arrays: Mapping[str, np.ndarray]) -> Arrays:
-    """Arrays under names that begin with `start`."""
-    return {f"{start}{name}": value for name, value in arrays.items()}
+            for key, value in under(arrays, f"{name}/").items():
+                # files hold no scalars: a step count has come back as (1,)
+                shape = () if key == "step" else parameter.shape
+                adam.state[parameter][key] = torch.tensor(value).reshape(shape)
 
 
 def under(arrays: Mapping[str, np.ndarray], start: str) -> Arrays:
@@ -153,8 +174,7 @@ def plain(value: Any) -> Any:
 def interruptions() -> Iterator[Callable[[], bool]]:
     """Hold SIGINT and SIGTERM back, so that a training stops between two steps, once it is saved.
 
-    Yields:
-        A function that tells whether one came. Outside the main thread signals stay as they are.
+    Yields a function that tells whether one came; outside the main thread signals stay as they are.
     """
     came: list[int] = []
 

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from cmc.learning.state import Arrays, State, learned, relearn, set_streams, streams
+from cmc.learning.state import Arrays, Kept, Learners, State
 from cmc.policies import StackedMLP, tanh
 
 Array32 = NDArray[np.float32]
@@ -30,35 +30,25 @@ class TD3Config:
     """Settings of one learner; defaults are the paper's `tab:para` unless marked.
 
     Attributes:
-        actor_rate: Adam step of the actor (the table calls it the target learning rate).
-        critic_rate: Adam step of the critics.
-        discount: per transition of this learner.
-        target_rate: part of the way that targets move at each target update.
-        target_period: critic updates between target updates.
-        actor_period: critic updates between actor updates (2, TD3's default).
         action_gradient_clip: bound on each entry of dQ/da, or None.
         gradient_clip: bound on the norm of each parameter's gradient, seed by seed, or None.
-        target_noise: standard deviation of the noise on target actions (0.2, TD3's default).
-        target_noise_clip: bound on that noise (0.5, TD3's default).
-        critic_hidden: hidden sizes of the tanh critics (our choice; the paper's are 400, 300).
-        batch: transitions of each seed in one update.
         critic_head_start: critic updates before the actor first moves (our choice: 0).
         pull: weight of the mean square of the actor's values before its last tanh, which keeps
             them where tanh still has a slope (our choice: 0).
     """
 
-    actor_rate: float = 1e-4
+    actor_rate: float = 1e-4  # of Adam; the table calls it the target learning rate
     critic_rate: float = 1e-3
-    discount: float = 0.99
-    target_rate: float = 0.005
-    target_period: int = 50
-    actor_period: int = 2
+    discount: float = 0.99  # per transition of this learner
+    target_rate: float = 0.005  # part of the way that targets move at each target update
+    target_period: int = 50  # critic updates between target updates
+    actor_period: int = 2  # and between actor updates, TD3's default
     action_gradient_clip: float | None = None
     gradient_clip: float | None = None
-    target_noise: float = 0.2
-    target_noise_clip: float = 0.5
-    critic_hidden: tuple[int, ...] = (128, 128)
-    batch: int = 128
+    target_noise: float = 0.2  # deviation of the noise on target actions, TD3's default
+    target_noise_clip: float = 0.5  # and its bound
+    critic_hidden: tuple[int, ...] = (128, 128)  # our choice; the paper's are 400, 300
+    batch: int = 128  # transitions of each seed in one update
     critic_head_start: int = 0
     pull: float = 0.0
 
@@ -70,19 +60,20 @@ class TD3Config:
             raise ValueError(f"wanted 0 <= discount <= 1 and 0 < target_rate <= 1: {self}")
 
 
-class TD3:
+class TD3(Kept):
     """One actor and twin critics for each seed.
 
     Args:
         actor: maps observations (seeds, batch, size) to actions in [-1, 1] (seeds, batch, action);
             with `pull` they are tanh(actor.unsquashed(observation)).
         seeds: one integer for each seed.
-        observation: size of an observation.
-        action: size of an action.
+        observation, action: sizes.
         config: settings.
         stream: separates learners that share their seeds (two levels, say).
         view: what the critics see of observations and actions; both as they are if None.
     """
+
+    kept = ("updates", "streams")
 
     def __init__(
         self,
@@ -109,18 +100,17 @@ class TD3:
             self.critics.parameters(), config.critic_rate, fused=True
         )
         self.updates = 0
-        self._generators = [np.random.default_rng([seed, stream, 13]) for seed in seeds]
+        self.streams = [np.random.default_rng([seed, stream, 13]) for seed in seeds]
 
     def values(self, critics: StackedMLP, observation: Tensor, action: Tensor) -> Tensor:
         """Both critics' values, (seeds, 2, batch)."""
         x = self._view(observation, action).repeat_interleave(2, dim=0)
         return critics(x)[..., 0].reshape(len(self.seeds), 2, -1)
 
-    def update(self, batch: Batch) -> dict[str, np.ndarray]:
+    def update(self, batch: Batch) -> np.ndarray:
         """One critic update, and now and then one of the actor and the targets.
 
-        Returns:
-            The critics' mean squared error of each seed, (seeds,).
+        Returns the critics' mean squared error, (seeds,).
         """
         error = self._update_critics(batch)
         self.updates += 1
@@ -131,7 +121,7 @@ class TD3:
         if self.updates % config.target_period == 0:
             _move(self.target_actor, self.actor, config.target_rate)
             _move(self.target_critics, self.critics, config.target_rate)
-        return {"critic_error": error}
+        return error
 
     def _update_critics(self, batch: Batch) -> np.ndarray:
         target = batch.reward
@@ -147,7 +137,7 @@ class TD3:
         error.sum().backward()
         self._clip(self.critics)
         self.critic_adam.step()
-        return error.detach().numpy().copy()
+        return error.detach().numpy()
 
     def _update_actor(self, batch: Batch) -> None:
         config = self.config
@@ -181,7 +171,7 @@ class TD3:
         self.critic_adam.param_groups[0]["lr"] = factor * self.config.critic_rate
 
     def _smoothing(self, like: Tensor) -> Tensor:
-        noise = [generator.standard_normal(like.shape[1:]) for generator in self._generators]
+        noise = [generator.standard_normal(like.shape[1:]) for generator in self.streams]
         scaled = self.config.target_noise * torch.from_numpy(np.stack(noise)).to(like.dtype)
         return scaled.clamp(-self.config.target_noise_clip, self.config.target_noise_clip)
 
@@ -196,7 +186,8 @@ class TD3:
                 norm = by_seed.norm(dim=1, keepdim=True)
                 by_seed.mul_((bound / norm.clamp(min=1e-12)).clamp(max=1.0))
 
-    def _learners(self) -> list[tuple[dict[str, nn.Parameter], torch.optim.Adam | None]]:
+    def learners(self) -> Learners:
+        """Actor and critics, and their targets."""
         modules = (
             ("actor", self.actor, self.actor_adam),
             ("critics", self.critics, self.critic_adam),
@@ -204,20 +195,6 @@ class TD3:
             ("target_critics", self.target_critics, None),
         )
         return [(dict(module.named_parameters(name)), adam) for name, module, adam in modules]
-
-    def state(self) -> State:
-        """Weights, targets, Adam, counter, random streams."""
-        arrays: Arrays = {}
-        for parameters, adam in self._learners():
-            arrays |= learned(parameters, adam)
-        return arrays, {"updates": self.updates, "streams": streams(self._generators)}
-
-    def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
-        """Continue from `state`."""
-        for parameters, adam in self._learners():
-            relearn(arrays, parameters, adam)
-        self.updates = int(record["updates"])
-        set_streams(self._generators, record["streams"])
 
 
 @torch.no_grad()
@@ -229,10 +206,10 @@ def _move(target: nn.Module, source: nn.Module, rate: float) -> None:
 
 @dataclass(frozen=True)
 class Batch:
-    """Transitions of all seeds: observation, action, reward, next observation, continues.
+    """Transitions of all seeds, (seeds, batch, size), and (seeds, batch) for reward and continues.
 
-    Shapes are (seeds, batch, size), and (seeds, batch) for reward and continues. `continues` is 1
-    where the next state's value counts and 0 where it does not; `extra` is what else was stored.
+    `continues` is 1 where the next state's value counts and 0 where it does not; `extra` is what
+    else was stored.
     """
 
     observation: Tensor
@@ -243,7 +220,7 @@ class Batch:
     extra: Tensor
 
 
-class Replay:
+class Replay(Kept):
     """The last `capacity` transitions of each seed.
 
     All seeds are written at the same pace, so one counter serves them all. Each seed draws its
@@ -251,12 +228,13 @@ class Replay:
 
     Args:
         seeds: one integer for each seed.
-        observation: size of an observation.
-        action: size of an action.
+        observation, action: sizes.
         capacity: transitions kept for each seed.
         stream: separates generators that share their seeds (two levels, say).
         extra: size of what else is stored with a transition.
     """
+
+    kept = ("written", "streams")
 
     def __init__(
         self,
@@ -276,7 +254,7 @@ class Replay:
         self.capacity = capacity
         self.rows: Array32 = np.zeros((len(seeds), capacity, sum(self.sizes)), dtype=np.float32)
         self.written = 0
-        self._generators = [np.random.default_rng([seed, stream, 11]) for seed in seeds]
+        self.streams = [np.random.default_rng([seed, stream, 11]) for seed in seeds]
 
     def __len__(self) -> int:
         return min(self.written, self.capacity)
@@ -309,21 +287,17 @@ class Replay:
         """Draw `size` transitions of each seed, with replacement."""
         if not len(self):
             raise ValueError("the replay memory is empty: add transitions before sampling")
-        drawn = np.stack(
-            [generator.integers(len(self), size=size) for generator in self._generators]
-        )
+        drawn = np.stack([generator.integers(len(self), size=size) for generator in self.streams])
         rows = torch.from_numpy(self.rows[np.arange(len(self.rows))[:, None], drawn])
         observation, action, reward, following, continues, extra = rows.split(self.sizes, dim=-1)
         return Batch(observation, action, reward[..., 0], following, continues[..., 0], extra)
 
     def state(self) -> State:
         """The rows in use, the counter, the random streams."""
-        record = {"written": self.written, "streams": streams(self._generators)}
-        return {"rows": self.rows[:, : len(self)]}, record
+        arrays, record = super().state()
+        return {"rows": self.rows[:, : len(self)], **arrays}, record
 
     def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
         """Continue from `state`."""
-        rows = arrays["rows"]
-        self.rows[:, : rows.shape[1]] = rows
-        self.written = int(record["written"])
-        set_streams(self._generators, record["streams"])
+        super().restore(arrays, record)
+        self.rows[:, : len(self)] = arrays["rows"]

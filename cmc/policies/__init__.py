@@ -1,9 +1,8 @@
 """Control policies in torch: positive networks, their unconstrained twins, transforms around them.
 
 A network maps the auxiliary signals s (..., n, 2), which hold (z_i, integral of z_i), to one output
-per dimension (..., n). A policy puts the transforms and the sign rule around a network and maps an
-observation to a command. Both carry an optional leading axis of seeds, so that several trainings
-run as one batched product.
+per dimension (..., n); a policy puts the transforms and the sign rule around it and maps an
+observation to a command. An optional leading axis of seeds runs several trainings as one batch.
 """
 
 from __future__ import annotations

@@ -14,7 +14,9 @@ together are judged by `cmc.theory.composite.certify_latent` from the two interv
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,16 +28,13 @@ from cmc.policies.networks import PositiveNetwork
 Array = NDArray[np.float64]
 
 
-class LatentSignal(nn.Module):
+class LatentSignal(PositiveNetwork):
     """y_i = phi_i(e_i, e_i'), zero at zero, with slopes between bounds that no training can break.
 
     Args:
         n: number of axes.
-        slope_min: smallest slopes in (e, e'), positive, broadcast to (n, 2).
-        slope_max: largest slopes, broadcast to (n, 2).
+        slope_min, slope_max: bounds on the slopes in (e, e'), positive, broadcast to (n, 2).
         hidden: sizes of the hidden layers.
-        seeds: one integer for each leading index, or None for no leading axis.
-        dtype: of the parameters.
 
     Raises:
         ValueError: if a slope may vanish, or the bounds leave no room.
@@ -48,87 +47,100 @@ class LatentSignal(nn.Module):
         slope_min: ArrayLike,
         slope_max: ArrayLike,
         hidden: Sequence[int] = (16, 16),
-        seeds: Sequence[int] | None = None,
-        dtype: torch.dtype = torch.float64,
     ) -> None:
-        super().__init__()
         if not (np.asarray(slope_min, dtype=float) > 0).all():
             raise ValueError(
                 f"wanted slope_min above 0, so that e' can be told from y; got {slope_min!r}"
             )
-        self.network = PositiveNetwork(
-            n,
-            hidden=hidden,
-            seeds=seeds,
-            bias=False,
-            slope_min=slope_min,
-            slope_max=slope_max,
-            dtype=dtype,
-        )
-        self.n = n
+        bounds: dict[str, Any] = {"slope_min": slope_min, "slope_max": slope_max}
+        super().__init__(n, hidden=hidden, bias=False, dtype=torch.float64, **bounds)
 
-    def forward(self, e: Tensor, e_dot: Tensor) -> Tensor:
+    def forward(self, e: Tensor, e_dot: Tensor) -> Tensor:  # type: ignore[override]
         """Latent signal of errors and their rates, (..., n) each, to (..., n)."""
-        return self.network(torch.stack([e, e_dot], dim=-1))
-
-    def slope_bounds(self) -> tuple[Array, Array]:
-        """Guaranteed interval of the slopes in (e, e'), ([seeds,] n, 2) each."""
-        return self.network.slope_bounds()
+        return super().forward(torch.stack([e, e_dot], dim=-1))
 
     @property
     def composition_rate(self) -> Array:
-        """Smallest slope in e over the largest in e', 1/s, ([seeds,] n)."""
+        """Smallest slope in e over the largest in e', 1/s, (n,)."""
         low, high = self.slope_bounds()
-        return low[..., 0] / high[..., 1]
+        return low[:, 0] / high[:, 1]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a motion costs: the mean over starts of int |e|^2 + effort |w|^2 dt for e'' = -p.
+
+    Attributes:
+        starts: errors and rates, (N, n, 2).
+        effort: price of w.
+        duration: s.
+        steps: of it; p is held over each.
+        priced: w (N, n) of e, e' and p (N, n), such as the torque behind p; p by default.
+    """
+
+    starts: ArrayLike
+    effort: float
+    duration: float
+    steps: int = 100
+    priced: Callable[[Tensor, Tensor, Tensor], Tensor] = lambda e, e_dot, p: p
+
+    def cost(self, act: Callable[[Tensor, Tensor, int], Tensor]) -> Tensor:
+        """The cost of p = act(e, e', k) at step k."""
+        start = torch.as_tensor(np.asarray(self.starts), dtype=torch.float64)
+        e, e_dot = start.unbind(-1)
+        h, cost = self.duration / self.steps, torch.zeros((), dtype=torch.float64)
+        for k in range(self.steps):
+            p = act(e, e_dot, k)
+            w = self.priced(e, e_dot, p)
+            cost = cost + h * (e.square() + self.effort * w.square()).sum(-1).mean()
+            e, e_dot = e + h * e_dot - h * h / 2 * p, e_dot - h * p  # exact under a held p
+        return cost
+
+    def optimum(self, rounds: int = 20) -> float:
+        """The least cost of all p (steps, N, n), without feedback or any other constraint."""
+        p = torch.zeros(self.steps, *np.shape(self.starts)[:2], dtype=torch.float64)
+        search = torch.optim.LBFGS([p.requires_grad_()], line_search_fn="strong_wolfe")
+
+        def cost() -> Any:
+            search.zero_grad()
+            value = self.cost(lambda e, e_dot, k: p[k])
+            value.backward()
+            return value
+
+        return min(search.step(cost).item() for _ in range(rounds))
 
 
 def improve(
-    signal: LatentSignal,
+    signal: Callable[[Tensor, Tensor], Tensor],
     policy: nn.Module,
     gains: tuple[float, float],
-    starts: ArrayLike,
+    trial: Trial,
     *,
-    effort: float,
-    duration: float,
-    steps: int = 100,
     updates: int = 150,
     rate: float = 0.02,
 ) -> list[float]:
-    """Learn signal and policy together, by the gradient of a simulated cost.
+    """Learn signal and policy together by Adam, on p = K_p e + K_d e' + pi(y, int y).
 
-    The cost is the mean over starts of int e^2 + effort p^2 dt for e'' = -p, with the whole command
-    p = K_p e + K_d e' + pi(y, int y), held over each step.
-
-    Args:
-        signal: what is learned; a signal without parameters that need gradients is kept.
-        policy: maps s = (y, int y), (..., n, 2), to (..., n), slopes positive.
-        gains: K_p and K_d of the task-space controller.
-        starts: errors and rates, (N, n, 2).
-        effort: price of the command.
-        duration: s.
-        steps: commands in that time.
-        updates: steps of Adam.
-        rate: learning rate.
-
-    Returns:
-        The cost before each update, and after the last.
+    The signal gives y (N, n) of e and e' and is kept where it is no module; the policy maps
+    s = (y, int y), (..., n, 2), to (..., n); `gains` are K_p and K_d, `updates` Adam's, of step
+    `rate`. Returns the cost before each update, and after the last.
     """
-    start = torch.as_tensor(np.asarray(starts), dtype=torch.float64)
-    learned = [p for p in [*signal.parameters(), *policy.parameters()] if p.requires_grad]
-    optimiser = torch.optim.Adam(learned, lr=rate)
-    h, costs = duration / steps, []
-    for update in range(updates + 1):
-        e, e_dot = start[..., 0], start[..., 1]
-        integral, cost = torch.zeros_like(e), torch.zeros((), dtype=torch.float64)
-        for _ in range(steps):
-            y = signal(e, e_dot)
-            integral = integral + h * y
-            p = gains[0] * e + gains[1] * e_dot + policy(torch.stack([y, integral], dim=-1))
-            cost = cost + h * (e.square() + effort * p.square()).sum(-1).mean()
-            e, e_dot = e + h * e_dot - h * h / 2 * p, e_dot - h * p  # exact under a held p
+    parts = [part for part in (signal, policy) if isinstance(part, nn.Module)]
+    optimiser = torch.optim.Adam([p for part in parts for p in part.parameters()], lr=rate)
+    integral = torch.zeros(())
+
+    def act(e: Tensor, e_dot: Tensor, k: int) -> Tensor:
+        nonlocal integral
+        y = signal(e, e_dot)
+        integral = (integral if k else 0.0) + trial.duration / trial.steps * y
+        return gains[0] * e + gains[1] * e_dot + policy(torch.stack([y, integral], dim=-1))
+
+    costs = []
+    for _ in range(updates):
+        optimiser.zero_grad()
+        cost = trial.cost(act)
+        cost.backward()  # type: ignore[no-untyped-call]
         costs.append(float(cost.detach()))
-        if update < updates:
-            optimiser.zero_grad()
-            cost.backward()
-            optimiser.step()
-    return costs
+        optimiser.step()
+    with torch.no_grad():
+        return [*costs, float(trial.cost(act))]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from itertools import chain
 from typing import Any
 
@@ -11,9 +11,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from cmc.policies.networks import LinearNetwork, PositiveNetwork
-from cmc.policies.rivals import IndependentNetwork, JointNetwork
-from cmc.policies.stacked import StackedMLP, tanh
+from cmc.policies.stacked import SignalNetwork, tanh
 
 Array = NDArray[np.float64]
 Real = NDArray[np.floating]
@@ -23,8 +21,8 @@ Function = Callable[[Real], Real]
 class ModularPolicy(nn.Module):
     """u = u0 + T_a a with a_i = -sign(R_ii) pi_i(z_i, integral of z_i) and z = T_y y.
 
-    The input is the latent signal y whose dynamics are z' = Lambda z + R a; the slope of the
-    command has the opposite sign of R_ii and nothing else flips a sign (`constraint_sign`).
+    Along z' = Lambda z + R a the slope of the command has the opposite sign of R_ii, and nothing
+    else flips a sign (`constraint_sign`).
 
     Args:
         network: maps s (..., n, 2) to (..., n); has an attribute `n`.
@@ -71,14 +69,18 @@ class ModularPolicy(nn.Module):
         self.register_buffer("R", _vector("R", R, self.n, dtype), persistent=False)
         if not bool((self.R != 0).all()):
             raise ValueError(f"wanted no zero on the diagonal of R; got {R!r}")
-        self.register_load_state_dict_pre_hook(_rename)
+
+    def signals(self, observation: Any) -> Any:
+        """The signals s (..., n, 2) that an observation (..., d) holds; torch or numpy."""
+        if "s" in self.layout:
+            s = observation[..., self.layout["s"]]
+            return s.reshape(*s.shape[:-1], self.n, 2)
+        parts = [observation[..., self.layout[name]] for name in ("z", "integral")]
+        return torch.stack(parts, -1) if isinstance(observation, Tensor) else np.stack(parts, -1)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the command (..., n) for an observation (..., d) laid out as `layout` says."""
-        if "s" in self.layout:
-            s = observation[..., self.layout["s"]].unflatten(-1, (self.n, 2))
-        else:
-            s = torch.stack([observation[..., self.layout[k]] for k in ("z", "integral")], -1)
+        s = self.signals(observation)
         R = observation[..., self.layout["R"]] if "R" in self.layout else self.R
         if "T_a" not in self.layout:
             return self.command(s, R)
@@ -107,11 +109,8 @@ class ModularPolicy(nn.Module):
             name = type(self.network).__name__
             raise TypeError(f"{name} has no slope_bounds(): nothing bounds its slopes")
         low, high = self.network.slope_bounds()  # type: ignore[operator]
-        if self.squash:  # tanh saturates
-            low = 0.0 * low
-        if not self.integral:
-            low[..., 1], high[..., 1] = 0.0, 0.0
-        return low, high
+        seen = np.array([1.0, float(self.integral)])
+        return low * seen * (not self.squash), high * seen  # tanh saturates
 
     def _visible(self, s: Tensor) -> Tensor:
         return s if self.integral else s * s.new_tensor([1.0, 0.0])
@@ -120,11 +119,8 @@ class ModularPolicy(nn.Module):
 class DirectPolicy(nn.Module):
     """u = u0 + network(part of the observation): no transforms, no sign rule.
 
-    Args:
-        network: maps the flat part (..., k) to (..., n), such as `JointNetwork(n, inputs=k)`.
-        part: which entries of the observation it sees; all by default.
-        u0: centre of the command, broadcast to (n,).
-        squash: tanh(network) in place of the network: commands within 1 of u0.
+    The network maps that part, flat (..., k), to (..., n), such as `JointNetwork(n, inputs=k)`;
+    with `squash` it is tanh(network), so that commands lie within 1 of u0.
     """
 
     u0: Tensor
@@ -141,23 +137,19 @@ class DirectPolicy(nn.Module):
         self.network, self.part, self.squash = network, part, squash
         self.n = int(network.n)  # type: ignore[arg-type]
         self.register_buffer("u0", _vector("u0", u0, self.n, _dtype(network)), persistent=False)
-        self.register_load_state_dict_pre_hook(_rename)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the command (..., n) for an observation (..., d)."""
         value = self.unsquashed(observation)
         return self.u0 + (tanh(value) if self.squash else value)
 
+    def signals(self, observation: Any) -> Any:
+        """What the network sees of an observation."""
+        return observation[..., self.part]
+
     def unsquashed(self, observation: Tensor) -> Tensor:
         """The network's values (..., n), before any tanh."""
-        return self.network(observation[..., self.part])
-
-
-def _rename(module: nn.Module, state: dict[str, Any], prefix: str, *_rest: Any) -> None:
-    """Names of older files: `net` was `network`, or the layers of a direct policy."""
-    to = "network." if isinstance(module, ModularPolicy) else "network.mlp."
-    for key in [k for k in state if k.startswith(f"{prefix}net.")]:
-        state[prefix + to + key.removeprefix(f"{prefix}net.")] = state.pop(key)
+        return self.network(self.signals(observation))
 
 
 def _dtype(module: nn.Module) -> torch.dtype:
@@ -172,17 +164,11 @@ def _vector(name: str, value: ArrayLike, n: int, dtype: torch.dtype) -> Tensor:
 
 
 def as_numpy(policy: nn.Module) -> Function:
-    """Return a function from numpy observations to numpy commands, the weights held as they are.
+    """A function from numpy observations to numpy commands, the weights held as they are.
 
-    Tanh networks behind `ModularPolicy` and `DirectPolicy` run in numpy, which for the few rows of
-    a control step costs a fifth of a call into torch; any other policy runs in torch.
-
-    Args:
-        policy: module from observations to commands.
-
-    Returns:
-        The function; it takes what the module takes, in the module's precision, and raises
-        ValueError for an observation that is not finite.
+    It takes what the module takes, in the module's precision, and raises ValueError for an
+    observation that is not finite. Stacked tanh networks run in numpy, which for the few rows of a
+    control step costs a fifth of a call into torch; any other policy runs in torch.
     """
     dtype = torch.empty(0, dtype=_dtype(policy)).numpy().dtype
     run = _in_numpy(policy) or _in_torch(policy)
@@ -206,86 +192,38 @@ def _in_torch(policy: nn.Module) -> Function:
 
 def _in_numpy(policy: nn.Module) -> Function | None:
     """The policy in numpy, or None where only torch will do."""
-    if isinstance(policy, DirectPolicy) and isinstance(policy.network, JointNetwork):
-        direct, centre, part = _joint(policy.network), policy.u0.numpy().copy(), policy.part
-        bound: Any = np.tanh if policy.squash else np.asarray
-        return lambda observation: centre + bound(direct(observation[..., part]))
-    if not isinstance(policy, ModularPolicy) or {"R", "T_a"} & set(policy.layout):
+    if not isinstance(policy, (ModularPolicy, DirectPolicy)):
         return None
-    if not policy.integral:
+    if not isinstance(policy.network, SignalNetwork):
         return None
-    network, n = policy.network, policy.n
-    pi: Function
-    if isinstance(network, JointNetwork) and not network.flat:
-        joint = _joint(network)
-        pi = lambda s: joint(s.reshape(*s.shape[:-2], 2 * n))  # noqa: E731
-    elif isinstance(network, (PositiveNetwork, IndependentNetwork)):
-        pi = _independent(network)
-    elif isinstance(network, LinearNetwork):
-        gains = network.gains.numpy().copy()
-        pi = lambda s: (gains * s).sum(-1)  # noqa: E731
-    else:
-        return None
-    centre, squash, layout = policy.u0.numpy().copy(), policy.squash, policy.layout
-    factor = (1.0 / policy.R if policy.normalise else torch.sign(policy.R)).numpy()
+    factor = np.array(-1.0, dtype=policy.u0.numpy().dtype)
+    if isinstance(policy, ModularPolicy):
+        if not policy.integral or {"R", "T_a"} & set(policy.layout):
+            return None
+        factor = (1.0 / policy.R if policy.normalise else torch.sign(policy.R)).numpy()
+    pi, centre, squash = _layers(policy.network), policy.u0.numpy().copy(), policy.squash
+    signals = policy.signals
 
     def run(observation: Real) -> Real:
-        if "s" in layout:
-            columns = observation[..., layout["s"]]
-            s = columns.reshape(*columns.shape[:-1], n, 2)
-        else:
-            s = np.stack([observation[..., layout["z"]], observation[..., layout["integral"]]], -1)
-        value = pi(s)
+        value = pi(signals(observation))
         return centre - factor * (np.tanh(value) if squash else value)  # constraint_sign
 
     return run
 
 
-def _joint(network: JointNetwork) -> Function:
-    evaluate = _layers(network.mlp, list(network.mlp.weights))
-    stack, inputs, outputs = network.mlp.stack, network.inputs, network.n
-
-    def run(x: Real) -> Real:
-        _check_seeds(x, network.seeds)
-        return evaluate(x.reshape(stack, -1, inputs)).reshape(*x.shape[:-1], outputs)
-
-    return run
-
-
-def _independent(network: PositiveNetwork | IndependentNetwork) -> Function:
-    weights, slope = list(network.mlp.weights), None
-    if isinstance(network, PositiveNetwork):
-        weights = network.positive_weights()
-        slope = network.slope_min.numpy().copy() if bool(network.slope_min.any()) else None
-    evaluate = _layers(network.mlp, weights)
-    n, seeds = network.n, network.seeds or 1
+def _layers(network: SignalNetwork) -> Function:
+    """The network with copies of its weights."""
+    W = [weight.detach().numpy().copy() for weight in network.used_weights()]
+    b = [bias.detach().numpy().copy() for bias in network.mlp.biases]
 
     def run(s: Real) -> Real:
-        _check_seeds(s, network.seeds)
-        x = s.reshape(seeds, -1, n, 2).swapaxes(1, 2).reshape(seeds * n, -1, 2)
-        pi = evaluate(x).reshape(seeds, n, -1).swapaxes(1, 2).reshape(s.shape[:-1])
-        return pi if slope is None else pi + (slope * s).sum(-1)
-
-    return run
-
-
-def _check_seeds(x: Real, seeds: int | None) -> None:
-    if seeds is not None and x.shape[0] != seeds:
-        raise ValueError(f"wanted a leading axis of {seeds} seeds; got shape {x.shape}")
-
-
-def _layers(mlp: StackedMLP, weights: Sequence[Tensor]) -> Function:
-    """The stacked network with copies of the given weights."""
-    W = [weight.detach().numpy().copy() for weight in weights]
-    b = [bias.detach().numpy().copy() for bias in mlp.biases]
-
-    def run(x: Real) -> Real:
+        x = network.inputs_of(s)
         for layer, weight in enumerate(W):
             x = np.matmul(x, weight)
             if b:
                 x += b[layer]
             if layer < len(W) - 1:
                 np.tanh(x, out=x)
-        return x
+        return network.outputs_of(x, s)
 
     return run

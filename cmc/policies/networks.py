@@ -10,7 +10,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from cmc.policies.stacked import StackedMLP, from_stack, to_stack
+from cmc.policies.stacked import SignalNetwork, StackedMLP
+from cmc.theory.arrays import checked
 
 Array = NDArray[np.float64]
 
@@ -19,7 +20,7 @@ class NegativeWeightError(ValueError):
     """A checkpoint holds negative weights where the sign condition needs positive ones."""
 
 
-class PositiveNetwork(nn.Module):
+class PositiveNetwork(SignalNetwork):
     """pi_i(s_i) = m_i . s_i + W_l tanh(... tanh(W_1 s_i + b_1)) + b_l, with W >= 0, for each i.
 
     With positive weights every slope is positive (`product`, `constraint_sign`). The linear bypass
@@ -33,14 +34,12 @@ class PositiveNetwork(nn.Module):
 
     Args:
         n: number of dimensions.
-        hidden: sizes of the hidden layers.
-        seeds: one integer for each leading index, or None for no leading axis.
+        hidden, seeds, dtype: see `StackedMLP`.
         bias: without biases the policy is odd, pi(-s) = -pi(s), and zero at zero.
         slope_min: m >= 0, broadcast to (n, 2): proportional and integral slope.
         slope_max: M > m, broadcast to (n, 2), or None for no cap.
         joint_cap: pair (v, limit), v >= 0 broadcast to (n, 2) and limit > 0 broadcast to (n,):
             the cap v . slope <= limit, such as the sampled-data bound with v = (1, h/2).
-        dtype: of the parameters.
 
     Raises:
         ValueError: for bounds that are not finite, negative, or leave no room for the network.
@@ -62,22 +61,15 @@ class PositiveNetwork(nn.Module):
         joint_cap: tuple[ArrayLike, ArrayLike] | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__()
-        self.n = n
-        self.mlp = StackedMLP(
-            2, 1, hidden, copies=n, seeds=seeds, bias=bias, start="positive", dtype=dtype
-        )
-        self.seeds = None if self.mlp.seeds is None else len(self.mlp.seeds)
+        sizes: dict[str, Any] = {"copies": n, "seeds": seeds, "bias": bias, "dtype": dtype}
+        super().__init__(n, StackedMLP(2, 1, hidden, start="positive", **sizes))
         low = _bound("slope_min", slope_min, (n, 2))
-        self._constant("slope_min", low, dtype)
-        self._bypass = bool(low.any())
-        self._constant("room", None, dtype)
-        self._constant("joint", None, dtype)
+        room = joint = None
         if slope_max is not None:
             high = _bound("slope_max", slope_max, (n, 2))
             if not (high > low).all():
                 raise ValueError(f"wanted slope_max above slope_min; got {high} and {low}")
-            self._constant("room", high - low, dtype)
+            room = high - low
         if joint_cap is not None:
             weight = _bound("joint cap weights", joint_cap[0], (n, 2))
             limit = _bound("joint cap limit", joint_cap[1], (n,))
@@ -87,16 +79,15 @@ class PositiveNetwork(nn.Module):
                     f"the joint cap {limit} leaves no room above slope_min {low} "
                     f"for the weights {weight}"
                 )
-            self._constant("joint", weight / left[:, None], dtype)  # v . P / left <= 1
+            joint = weight / left[:, None]  # v . P / left <= 1
+        self._bypass = bool(low.any())
+        for name, value in (("slope_min", low), ("room", room), ("joint", joint)):
+            tensor = None if value is None else torch.as_tensor(value, dtype=dtype)
+            self.register_buffer(name, tensor, persistent=False)
         self.register_state_dict_post_hook(_export_positive)
         self.register_load_state_dict_pre_hook(_refuse_negative)
 
-    def _constant(self, name: str, value: Array | None, dtype: torch.dtype) -> None:
-        """Keep a number of the configuration; it is not part of the state dict."""
-        tensor = None if value is None else torch.as_tensor(value, dtype=dtype)
-        self.register_buffer(name, tensor, persistent=False)
-
-    def positive_weights(self) -> list[Tensor]:
+    def used_weights(self) -> list[Tensor]:
         """Weights (stack, in, out) as used: absolute values, caps on the first and last."""
         weights = [weight.abs() for weight in self.mlp.weights]
         if self.room is None and self.joint is None:
@@ -111,16 +102,17 @@ class PositiveNetwork(nn.Module):
             weights[-1] = weights[-1] * scale.reshape(-1, 1, 1)
         return weights
 
-    def forward(self, s: Tensor) -> Tensor:
-        """Evaluate the networks: s (..., n, 2) to (..., n); with seeds s is (seeds, ..., n, 2)."""
-        out = self.mlp.run(to_stack(s, self.seeds, self.n), self.positive_weights())
-        pi = from_stack(out[..., 0], s, self.seeds)
-        return pi + (self.slope_min * s).sum(-1) if self._bypass else pi
+    def outputs_of(self, out: Any, s: Any) -> Any:
+        """What the stack answers, with the bypass, (..., n)."""
+        pi = super().outputs_of(out, s)
+        if not self._bypass:
+            return pi
+        low = self.slope_min if isinstance(s, Tensor) else self.slope_min.numpy()
+        return pi + (low * s).sum(-1)
 
     def jacobian(self, s: Tensor) -> Tensor:
         """Slopes d pi_i / d s_ij in closed form (`product`): s (..., n, 2) to (..., n, 2)."""
-        slope = self.mlp.slopes(to_stack(s, self.seeds, self.n), self.positive_weights())
-        return from_stack(slope, s, self.seeds) + self.slope_min
+        return super().jacobian(s) + self.slope_min
 
     def slope_bounds(self) -> tuple[Array, Array]:
         """Guaranteed interval of each slope for the present weights, ([seeds,] n, 2) each.
@@ -129,26 +121,22 @@ class PositiveNetwork(nn.Module):
         """
         with torch.no_grad():
             low = self.slope_min.double().numpy()
-            high = _product([weight.double() for weight in self.positive_weights()])
-        shape = (self.n, 2) if self.seeds is None else (self.seeds, self.n, 2)
-        return np.broadcast_to(low, shape).copy(), high.reshape(shape).numpy() + low
+            high = _product([weight.double() for weight in self.used_weights()]).numpy()
+        high = high.reshape(*([self.seeds] if self.seeds else []), self.n, 2) + low
+        return np.broadcast_to(low, high.shape).copy(), high
 
 
 class LinearNetwork(nn.Module):
     """pi_i = k_i1 z_i + k_i2 integral of z_i with fixed gains: the control engineer's baseline.
 
-    Args:
-        gains: k, (n, 2), not part of the state dict.
-        seeds: one integer for each leading index, or None for no leading axis.
+    The gains k (n, 2) are not part of the state dict; `seeds` give bounds their leading axis.
     """
 
     gains: Tensor
 
     def __init__(self, gains: ArrayLike, seeds: Sequence[int] | None = None) -> None:
         super().__init__()
-        found = torch.as_tensor(np.asarray(gains, dtype=np.float32))
-        if found.ndim != 2 or found.shape[1] != 2:
-            raise ValueError(f"wanted gains of shape (n, 2); got {tuple(found.shape)}")
+        found = torch.as_tensor(checked("gains", gains, "n 2").astype(np.float32))
         self.n, self.seeds = len(found), None if seeds is None else len(seeds)
         self.register_buffer("gains", found, persistent=False)
 
@@ -162,8 +150,7 @@ class LinearNetwork(nn.Module):
 
     def slope_bounds(self) -> tuple[Array, Array]:
         """The gains are both bounds, ([seeds,] n, 2) each."""
-        gains = self.gains.double().numpy()
-        gains = gains.copy() if self.seeds is None else np.tile(gains, (self.seeds, 1, 1))
+        gains = np.tile(self.gains.double().numpy(), (self.seeds, 1, 1) if self.seeds else 1)
         return gains, gains.copy()
 
 
@@ -176,7 +163,6 @@ def _product(weights: Sequence[Tensor]) -> Tensor:
 
 
 def _bound(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Broadcast a bound to `shape`; it must be finite and not negative."""
     array = np.asarray(value, dtype=np.float64)
     try:
         array = np.broadcast_to(array, shape).copy()
@@ -187,9 +173,7 @@ def _bound(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def _export_positive(
-    module: nn.Module, state: dict[str, Any], prefix: str, _metadata: Mapping[str, Any]
-) -> None:
+def _export_positive(module: nn.Module, state: dict[str, Any], prefix: str, *_rest: Any) -> None:
     """Write weights to a state dict as they are used, so that a file shows their sign."""
     for name in state:
         if name.startswith(f"{prefix}mlp.weights."):

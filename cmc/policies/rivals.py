@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from cmc.policies.stacked import StackedMLP, check_seeds, from_stack, tanh, to_stack
+from cmc.policies.stacked import SignalNetwork, StackedMLP, check_seeds, check_signals, tanh
 
 Array = NDArray[np.float64]
 
 
-class IndependentNetwork(nn.Module):
-    """One network per dimension on its own (z_i, integral of z_i), weights of any sign.
-
-    Args:
-        n: number of dimensions.
-        hidden: sizes of the hidden layers.
-        seeds: one integer for each leading index, or None for no leading axis.
-        last: factor on the last layer's start.
-        dtype: of the parameters.
-    """
+class IndependentNetwork(SignalNetwork):
+    """One network per dimension on its own (z_i, integral of z_i), weights of any sign."""
 
     def __init__(
         self,
@@ -31,35 +24,15 @@ class IndependentNetwork(nn.Module):
         *,
         hidden: Sequence[int] = (32, 32),
         seeds: Sequence[int] | None = None,
-        last: float = 0.1,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__()
-        self.n = n
-        self.mlp = StackedMLP(2, 1, hidden, copies=n, seeds=seeds, last=last, dtype=dtype)
-        self.seeds = None if self.mlp.seeds is None else len(self.mlp.seeds)
-
-    def forward(self, s: Tensor) -> Tensor:
-        """Evaluate the networks: s (..., n, 2) to (..., n); with seeds s is (seeds, ..., n, 2)."""
-        out = self.mlp(to_stack(s, self.seeds, self.n))
-        return from_stack(out[..., 0], s, self.seeds)
-
-    def jacobian(self, s: Tensor) -> Tensor:
-        """Slopes d pi_i / d s_ij in closed form (`product`): s (..., n, 2) to (..., n, 2)."""
-        slope = self.mlp.slopes(to_stack(s, self.seeds, self.n), list(self.mlp.weights))
-        return from_stack(slope, s, self.seeds)
+        super().__init__(n, StackedMLP(2, 1, hidden, copies=n, seeds=seeds, last=0.1, dtype=dtype))
 
 
-class JointNetwork(nn.Module):
+class JointNetwork(SignalNetwork):
     """One network that sees the signals of all dimensions, weights of any sign.
 
-    Args:
-        n: number of dimensions, that is outputs.
-        inputs: size of the flat input; by default 2 n, the auxiliary signals of all dimensions.
-        hidden: sizes of the hidden layers.
-        seeds: one integer for each leading index, or None for no leading axis.
-        last: factor on the last layer's start.
-        dtype: of the parameters.
+    With `inputs` it sees a flat (..., inputs) in place of s (..., n, 2).
     """
 
     def __init__(
@@ -72,26 +45,22 @@ class JointNetwork(nn.Module):
         last: float = 0.1,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        super().__init__()
-        self.n = n
         self.inputs = 2 * n if inputs is None else inputs
-        self.flat = inputs is not None
-        self.mlp = StackedMLP(self.inputs, n, hidden, seeds=seeds, last=last, dtype=dtype)
-        self.seeds = None if self.mlp.seeds is None else len(self.mlp.seeds)
+        self._axes = 2 if inputs is None else 1  # of an input
+        mlp = StackedMLP(self.inputs, n, hidden, seeds=seeds, last=last, dtype=dtype)
+        super().__init__(n, mlp)
 
-    def forward(self, s: Tensor) -> Tensor:
-        """Evaluate the network: s (..., n, 2), or (..., inputs) if sizes were given, to (..., n).
+    def inputs_of(self, s: Any) -> Any:
+        """Signals (..., n, 2), or flat inputs (..., inputs), to (seeds, batch, inputs)."""
+        count, size = self.seeds or 1, int(np.prod(s.shape[-self._axes :]))
+        if size != self.inputs or (self.seeds is not None and s.shape[0] != count):
+            lead = "" if self.seeds is None else f"{count} seeds, "
+            raise ValueError(f"wanted ({lead}..., {self.inputs}) flat inputs; got {tuple(s.shape)}")
+        return s.reshape(count, -1, self.inputs)
 
-        Raises:
-            ValueError: if the last axes or the leading axis of seeds have another size.
-        """
-        x = s if self.flat else s.flatten(-2)
-        stack = self.mlp.stack
-        if x.shape[-1] != self.inputs or (self.seeds is not None and x.shape[0] != stack):
-            lead = "" if self.seeds is None else f"{stack}, "
-            raise ValueError(f"wanted ({lead}..., {self.inputs}) flat inputs; got {tuple(x.shape)}")
-        out = self.mlp(x.reshape(stack, -1, self.inputs))
-        return out.reshape(*x.shape[:-1], self.n)
+    def outputs_of(self, out: Any, s: Any) -> Any:
+        """What the network answers, (seeds, batch, n), to (..., n)."""
+        return out.reshape(*s.shape[: -self._axes], self.n)
 
     def jacobian(self, s: Tensor) -> Tensor:
         """Slopes d pi_i / d s_ij of each output in its own signals: s (..., n, 2) to the same."""
@@ -99,10 +68,10 @@ class JointNetwork(nn.Module):
             s = s.detach().requires_grad_(True)
             out = self(s)
             rows = [
-                torch.autograd.grad(out[..., i].sum(), s, retain_graph=True)[0]
+                torch.autograd.grad(out[..., i].sum(), s, retain_graph=True)[0][..., i, :]
                 for i in range(self.n)
             ]
-        return torch.stack([row[..., i, :] for i, row in enumerate(rows)], dim=-2)
+        return torch.stack(rows, dim=-2)
 
 
 class ConvexGradientNetwork(nn.Module):
@@ -115,12 +84,7 @@ class ConvexGradientNetwork(nn.Module):
     a strictly monotone map of all dimensions together: its Jacobian W diag(a tanh') W' + mu I is
     symmetric and positive definite, where the positive network has one positive slope a dimension.
 
-    Args:
-        n: number of dimensions.
-        hidden: number of hidden units of each term.
-        seeds: one integer for each leading index, or None for no leading axis.
-        mu: strict convexity, > 0.
-        dtype: of the parameters.
+    `hidden` is the number of units h of each term.
     """
 
     def __init__(
@@ -149,10 +113,7 @@ class ConvexGradientNetwork(nn.Module):
 
     def _stacked(self, s: Tensor) -> Tensor:
         """Move s ([seeds,] ..., n, 2) to (seeds * 2, batch, n): one row for each term."""
-        if s.ndim < 2 + (self.seeds is not None) or tuple(s.shape[-2:]) != (self.n, 2):
-            raise ValueError(f"wanted s of shape (..., {self.n}, 2); got {tuple(s.shape)}")
-        if self.seeds is not None and s.shape[0] != self.seeds:
-            raise ValueError(f"wanted a leading axis of {self.seeds} seeds; got {tuple(s.shape)}")
+        check_signals(s, self.n, self.seeds)
         x = s.reshape(self.seeds or 1, -1, self.n, 2)
         return x.permute(0, 3, 1, 2).reshape(-1, x.shape[1], self.n)
 

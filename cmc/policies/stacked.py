@@ -15,11 +15,7 @@ NARROW = 16
 
 
 def check_seeds(seeds: Sequence[int] | None) -> tuple[int, ...] | None:
-    """Return the seeds as a tuple, or None for one network without a leading axis.
-
-    Raises:
-        ValueError: if there is no seed, or one is negative.
-    """
+    """The seeds as a tuple, or None for one network without a leading axis."""
     if seeds is None:
         return None
     seeds = tuple(int(seed) for seed in seeds)
@@ -31,19 +27,16 @@ def check_seeds(seeds: Sequence[int] | None) -> tuple[int, ...] | None:
 class StackedMLP(nn.Module):
     """Tanh networks x -> W_l tanh(... tanh(W_1 x + b_1)) + b_l, one for each index of a stack.
 
-    The stack is the product of the seeds (if any) and `copies`; all networks of the stack are
-    evaluated by one `baddbmm` a layer. Each seed draws its own start, so that a network does not
-    depend on which others are in the stack.
+    The stack is the product of the seeds (if any) and `copies`, one `baddbmm` a layer. Each seed
+    draws its own start: a network does not depend on which others are in the stack.
 
     Args:
-        inputs: size of the input.
-        outputs: size of the output.
-        hidden: sizes of the hidden layers, at least one.
+        inputs, outputs, hidden: sizes; at least one hidden layer.
         copies: networks a seed (one per dimension), or 1.
         seeds: one integer for each leading index, or None for no leading axis (start from 0).
-        bias: whether layers have biases; without them the network is odd.
+        bias: without biases the network is odd.
         start: "positive" draws weights from U(0, 2)/fan_in and hidden biases from U(-1, 1);
-            "signed" draws weights from N(0, 1)/sqrt(fan_in), no biases, last layer times `last`.
+            "signed" draws weights from N(0, 1)/sqrt(fan_in), no biases.
         last: factor on the last layer's start.
         dtype: of the parameters.
     """
@@ -69,26 +62,27 @@ class StackedMLP(nn.Module):
                 f"inputs {inputs}, hidden {tuple(hidden)}, outputs {outputs}, copies {copies}"
             )
         self.seeds = check_seeds(seeds)
-        self.copies, self.bias = copies, bias
-        weights, biases = [], []
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for layer, (fan_in, fan_out) in enumerate(zip(sizes, sizes[1:], strict=False)):
             final = layer == len(sizes) - 2
-            drawn = [
-                _draw(seed, layer, (copies, fan_in, fan_out), start, last if final else 1.0)
-                for seed in self.seeds or (0,)
-            ]
-            weight, shift = (np.concatenate(part) for part in zip(*drawn, strict=True))
-            weights.append(nn.Parameter(torch.as_tensor(weight, dtype=dtype)))
+            weight, shift = [], []
+            for seed in self.seeds or (0,):
+                rng, shape = np.random.default_rng([seed, layer]), (copies, fan_in, fan_out)
+                if start == "positive":
+                    drawn = rng.uniform(0.0, 2.0, shape) / fan_in
+                else:
+                    drawn = rng.standard_normal(shape) / np.sqrt(fan_in)
+                weight.append((last if final else 1.0) * drawn)
+                shift.append(rng.uniform(-1.0, 1.0, (copies, 1, fan_out)))
+            self.weights.append(_parameter(weight, dtype))
             if bias:
-                shift = 0.0 * shift if final or start == "signed" else shift
-                biases.append(nn.Parameter(torch.as_tensor(shift, dtype=dtype)))
-        self.weights = nn.ParameterList(weights)
-        self.biases = nn.ParameterList(biases)
+                still = final or start == "signed"
+                self.biases.append(_parameter(0.0 * np.array(shift) if still else shift, dtype))
 
     @property
     def stack(self) -> int:
         """Number of networks in the stack."""
-        return len(self.seeds or (0,)) * self.copies
+        return len(self.weights[0])
 
     def forward(self, x: Tensor) -> Tensor:
         """Evaluate all networks: x (stack, batch, inputs) to (stack, batch, outputs)."""
@@ -101,14 +95,10 @@ class StackedMLP(nn.Module):
         biases = list(self.biases) if biases is None else biases
         return _Network.apply(x, len(weights), *weights, *biases)
 
-    def hidden_values(self, x: Tensor, weights: Sequence[Tensor]) -> list[Tensor]:
-        """Values after every layer, the output last; x (stack, batch, inputs)."""
-        return _layers(x, weights, list(self.biases))
-
     def slopes(self, x: Tensor, weights: Sequence[Tensor]) -> Tensor:
         """Derivatives of the first output by the inputs, in closed form: (stack, batch, inputs)."""
         slope = weights[-1][..., :1].transpose(1, 2)
-        hidden = self.hidden_values(x, weights)[:-1]
+        hidden = _layers(x, weights, list(self.biases))[:-1]
         for value, weight in zip(hidden[::-1], weights[-2::-1], strict=True):
             slope = ((1.0 - value * value) * slope) @ weight.transpose(1, 2)  # M_j W_j of `product`
         return slope
@@ -172,43 +162,56 @@ class _Network(torch.autograd.Function):
         return slope if wanted[0] else None, None, *to_weights, *to_biases
 
 
-def _draw(
-    seed: int, layer: int, shape: tuple[int, int, int], start: Start, factor: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw the weights (copies, in, out) and biases (copies, 1, out) of one seed's layer."""
-    rng = np.random.default_rng([seed, layer])
-    fan_in = shape[1]
-    if start == "positive":
-        weight = rng.uniform(0.0, 2.0, shape) / fan_in
-    else:
-        weight = rng.standard_normal(shape) / np.sqrt(fan_in)
-    return factor * weight, rng.uniform(-1.0, 1.0, (shape[0], 1, shape[2]))
+def _parameter(rows: Any, dtype: torch.dtype) -> nn.Parameter:
+    return nn.Parameter(torch.as_tensor(np.concatenate(rows), dtype=dtype))
 
 
-def to_stack(s: Tensor, seeds: int | None, n: int) -> Tensor:
-    """Move s (..., n, 2), or (seeds, ..., n, 2), to (seeds * n, batch, 2).
-
-    Raises:
-        ValueError: if the last axes are not (n, 2) or the first is not the seeds.
-    """
+def check_signals(s: Any, n: int, seeds: int | None) -> None:
+    """Refuse signals that are not (..., n, 2), or (seeds, ..., n, 2) where there are seeds."""
     if s.ndim < 2 or tuple(s.shape[-2:]) != (n, 2):
         raise ValueError(
             f"wanted s of shape (..., {n}, 2) holding (z, integral of z); got {tuple(s.shape)}"
         )
-    if seeds is None:
-        return s.reshape(-1, n, 2).transpose(0, 1)
-    if s.ndim < 3 or s.shape[0] != seeds:
+    if seeds is not None and (s.ndim < 3 or s.shape[0] != seeds):
         raise ValueError(f"wanted a leading axis of {seeds} seeds; got shape {tuple(s.shape)}")
-    return s.reshape(seeds, -1, n, 2).transpose(1, 2).reshape(seeds * n, -1, 2)
 
 
-def from_stack(out: Tensor, like: Tensor, seeds: int | None) -> Tensor:
-    """Move a stacked result (seeds * n, batch[, k]) back to (..., n[, k]), batched as `like`."""
-    n, tail = like.shape[-2], out.shape[2:]
-    if seeds is None:
-        return out.transpose(0, 1).reshape(*like.shape[:-1], *tail)
-    out = out.reshape(seeds, n, *out.shape[1:]).transpose(1, 2)
-    return out.reshape(*like.shape[:-1], *tail)
+class SignalNetwork(nn.Module):
+    """Stacked networks on s (..., n, 2): by default `mlp` holds one for each of n dimensions.
+
+    With seeds s is (seeds, ..., n, 2). What moves arrays about takes torch and numpy alike.
+    """
+
+    def __init__(self, n: int, mlp: StackedMLP) -> None:
+        super().__init__()
+        self.n, self.mlp = n, mlp
+        self.seeds = None if mlp.seeds is None else len(mlp.seeds)
+
+    def used_weights(self) -> list[Tensor]:
+        """Weights (stack, in, out) as they are used."""
+        return list(self.mlp.weights)
+
+    def inputs_of(self, s: Any) -> Any:
+        """What the stack sees of s, (seeds * n, batch, 2)."""
+        check_signals(s, self.n, self.seeds)
+        count = self.seeds or 1
+        return s.reshape(count, -1, self.n, 2).swapaxes(1, 2).reshape(count * self.n, -1, 2)
+
+    def outputs_of(self, out: Any, s: Any) -> Any:
+        """What the stack answers, (seeds * n, batch, 1), to (..., n), batched as s."""
+        return self._back(out[..., 0], s)
+
+    def _back(self, out: Any, s: Any) -> Any:
+        out = out.reshape(self.seeds or 1, self.n, *out.shape[1:]).swapaxes(1, 2)
+        return out.reshape(*s.shape[:-1], *out.shape[3:])
+
+    def forward(self, s: Tensor) -> Tensor:
+        """Evaluate the networks: s (..., n, 2) to (..., n)."""
+        return self.outputs_of(self.mlp.run(self.inputs_of(s), self.used_weights()), s)
+
+    def jacobian(self, s: Tensor) -> Tensor:
+        """Slopes d pi_i / d s_ij in closed form (`product`): s (..., n, 2) to (..., n, 2)."""
+        return self._back(self.mlp.slopes(self.inputs_of(s), self.used_weights()), s)
 
 
 class _Tanh(torch.autograd.Function):
@@ -234,9 +237,6 @@ def tanh(x: Tensor) -> Tensor:
 
     On the CPU numpy computes the values (its vector code is several times faster than torch's);
     elsewhere, and for types that numpy lacks, this is `torch.tanh`.
-
-    Args:
-        x: any shape, real.
     """
     if x.device.type != "cpu" or x.dtype not in (torch.float32, torch.float64):
         return torch.tanh(x)

@@ -1,0 +1,295 @@
+"""Exercises of lessons 10 to 13."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+
+from cmc.envs.peg_push import BOX_TOP, PUSH, PegPush
+from cmc.exercises import check, expect, expect_close, numbers
+from cmc.plants import Plant
+from cmc.policies import ModularPolicy, PositiveNetwork
+from cmc.robot.panda import JOINTS, READY, load_scene
+from cmc.theory.certify import certify
+from cmc.theory.combinations import transforms_that_fit
+from cmc.theory.exact import Region
+
+# ---- lesson 10: the task-space torque, a posture the tip does not feel, a soft press
+
+
+def _states() -> Iterator[tuple[np.ndarray, ...]]:
+    """M (7, 7), J (6, 7), h (7,) and J' q' (6,) of the Panda in random states."""
+    model = load_scene("panda.xml")
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    site = model.site("tip_nominal").id
+    for _ in range(5):
+        data.qpos[:JOINTS] = READY + 0.3 * rng.normal(size=JOINTS)
+        data.qvel[:JOINTS] = rng.normal(size=JOINTS)
+        mujoco.mj_forward(model, data)
+        M, (J, rate) = np.zeros((model.nv, model.nv)), np.zeros((2, 6, model.nv))
+        mujoco.mj_fullM(model, data, M)
+        mujoco.mj_jacSite(model, data, J[:3], J[3:], site)
+        body = int(model.site_bodyid[site])
+        mujoco.mj_jacDot(model, data, rate[:3], rate[3:], data.site_xpos[site], body)
+        yield M, J, data.qfrc_bias - data.qfrc_passive, rate @ data.qvel
+
+
+@check("10-torque")
+def torque(answer: Any) -> None:
+    """Judge `my_torque(M, J, h, drift, p)` by the tip acceleration it gives, J M^-1 (tau - h)."""
+    rng = np.random.default_rng(1)
+    for M, J, h, drift in _states():
+        p = rng.normal(size=6)
+        tau = numbers(answer(M, J, h, drift, p), (JOINTS,), "the torque")
+        found = J @ np.linalg.solve(M, tau - h) + drift
+        slips = {
+            "J' q' counts twice: p is the whole acceleration x''": p + drift,
+            "h is missing": p - J @ np.linalg.solve(M, h),
+        }
+        expect_close(found, p, "the tip acceleration under your torque", slips, atol=1e-7)
+        right = np.allclose(tau, M @ np.linalg.pinv(J) @ (p - drift) + h, atol=1e-6)
+        hint = "the tip is right, but the joints differ: the acceleration form was asked for, M J^+"
+        expect(right, hint)
+
+
+@check("10-posture")
+def posture(answer: Any) -> None:
+    """Judge `my_posture(M, J, qn)`: J M^-1 tau = 0, and as much of q'' = qn as that allows."""
+    rng = np.random.default_rng(2)
+    for M, J, _, _ in _states():
+        qn = rng.normal(size=JOINTS)
+        made = np.linalg.solve(M, numbers(answer(M, J, qn), (JOINTS,), "the torque"))
+        expect_close(J @ made, np.zeros(6), "what your torque does to the tip", atol=1e-7)
+        free = np.linalg.svd(J)[2][-1]  # the joint motion that the tip does not feel
+        wanted = free @ qn, free @ M @ qn / (free @ M @ free)
+        expect(
+            np.isclose(free @ made, wanted).any(),
+            f"the elbow should accelerate at {wanted[0]:.3g} or {wanted[1]:.3g} (M-weighted),"
+            f" yours at {free @ made:.3g}",
+        )
+
+
+@check("10-limit")
+def limit(answer: Any) -> None:
+    """Judge `my_limit(mass, K_p, clip)`: mass (K_p clip + limit) = 1 N, and never below 0."""
+    for mass, clip in ((1.7, 0.005), (4.0, 0.004), (7.0, 0.005)):
+        name = f"the limit for {mass} kg and {1e3 * clip:g} mm"
+        expect_close(answer(mass, 40.0, clip), max(0.0, 1.0 / mass - 40.0 * clip), name)
+
+
+# ---- lesson 11: TD3's target, off-policy correction, the designer's gain
+
+
+Array = np.ndarray
+
+
+@check("11-target")
+def target(answer: Any) -> None:
+    """Judge `my_target(reward, following, actor, critics, discount, noise)` without noise first."""
+    draw = torch.Generator().manual_seed(0)
+    reward, following = torch.randn(64, 1, generator=draw), torch.randn(64, 15, generator=draw)
+    critics = (lambda x: x[:, 15:18].sum(-1, keepdim=True), lambda x: 0.5 - x[:, 15:16])
+
+    def ask(noise: float) -> Any:
+        return answer(reward, following, lambda s: 0.7 * s[:, :3], critics, 0.5, noise)
+
+    a = torch.tanh(0.7 * following[:, :3])
+    values = a.sum(-1, keepdim=True), 0.5 - a[:, :1]
+    found = ask(0.0)
+    found = found.detach() if isinstance(found, torch.Tensor) else found
+    slips: dict[str, Any] = {
+        "the smaller of the two values, not the larger": reward + 0.5 * torch.maximum(*values),
+        "the smaller of the two values, not their mean": reward + 0.25 * (values[0] + values[1]),
+        "one critic alone is too hopeful: take the smaller value": reward + 0.5 * values[0],
+        "the discount is missing": reward + torch.minimum(*values),
+        "the reward is missing": 0.5 * torch.minimum(*values),
+    }
+    wanted: Any = reward + 0.5 * torch.minimum(*values)
+    expect_close(found, wanted, "the target without noise", slips, atol=1e-5)
+    expect(not torch.allclose(ask(0.2), wanted), "the slow actor's action should get noise")
+    expect(
+        bool(((ask(100.0) - reward).abs() <= 0.5 * 3.0 + 1e-5).all()),
+        "noise and action should stay in their bounds: clip the noise to 0.5, the action to 1",
+    )
+
+
+@check("11-relabel")
+def relabel(answer: Any) -> None:
+    """Judge `my_choice(states, actions, goals, act)`: the position of the likeliest sub-goal.
+
+    Segments are made by low levels that pursue one of the candidates, with noise. A wrong choice
+    is compared with what common slips would choose.
+    """
+    rng = np.random.default_rng(0)
+    for trial in range(40):
+        n, ticks, count = (int(rng.integers(*ends)) for ends in ((1, 5), (3, 9), (2, 7)))
+        W = rng.normal(size=(n, 2 * n))
+
+        def act(state: Array, left: Array, W: Array = W) -> Array:
+            return np.tanh(W @ np.concatenate([state, 2.0 * left]))
+
+        goals = rng.normal(size=(count, n))
+        states, actions = [rng.normal(size=n)], list[Array]()
+        left = goals[int(rng.integers(count))]
+        for _ in range(ticks):
+            actions.append(act(states[-1], left) + 0.3 * rng.normal(size=n))
+            states.append(states[-1] + 0.4 * rng.normal(size=n))
+            left = left + states[-2] - states[-1]
+        seen, did = np.array(states[:-1]), np.array(actions)
+        shrinking, whole = (_losses(seen, did, goals, act, shrink) for shrink in (True, False))
+        best, found = int(np.argmin(shrinking)), answer(seen, did, goals, act)
+        place = int(numbers(found, (), "the choice"))
+        hint = f"the answer should be a position from 0 to {count - 1}, yours is {found!r}"
+        expect(0 <= place < count, hint)
+        hint = "is yours the largest squared error?" if place == np.argmax(shrinking) else ""
+        if place == np.argmin(whole) != best:
+            hint = "what is left of a sub-goal shrinks while it is pursued: g' = s + g - s'"
+        expect(
+            place == best,
+            f"segment {trial}: candidate {best} explains the actions best (squared error "
+            f"{shrinking[best]:.2f}, yours {shrinking[place]:.2f}). {hint}",
+        )
+
+
+def _losses(states: Array, actions: Array, goals: Array, act: Any, shrink: bool) -> Array:
+    """Sum of squared errors for each candidate, with or without a sub-goal that shrinks."""
+    acted = [[act(s, goal + shrink * (states[0] - s)) for s in states] for goal in goals]
+    return np.asarray(((actions - np.array(acted)) ** 2).sum((1, 2)))
+
+
+@check("11-gain")
+def gain(answer: Any) -> None:
+    """Judge `my_gain(K_p, K_d, h, level)`: (K_d + g K_2) h = level with the smaller root K_2."""
+    for K_p, K_d, h, level in ((40.0, 20.0, 0.02, 1.0), (20.0, 30.0, 0.02, 2.0), (20, 10, 0.01, 1)):
+        small, large = (2 * K_p / (K_d + s * np.sqrt(K_d**2 - 4 * K_p)) for s in (1, -1))
+        slips = {"this is the larger root: K_d *plus* the square root": (level / h - K_d) / large}
+        wanted, name = (level / h - K_d) / small, f"the gain for K_p = {K_p}, K_d = {K_d}"
+        expect_close(answer(K_p, K_d, h, level), wanted, name, slips)
+
+
+# ---- lesson 12: the return of a segment, the discount that decides, a plan
+
+
+@check("12-segment-return")
+def segment_return(answer: Any) -> None:
+    """Judge `my_segment_return(rewards, horizon)`: the sum from every tick to its segment's end."""
+    rng = np.random.default_rng(0)
+    for segments, horizon in ((1, 4), (3, 5), (50, 20)):
+        rewards = rng.normal(size=segments * horizon)
+        found = numbers(answer(rewards.copy(), horizon), rewards.shape, "the return of every tick")
+        last = slice(horizon - 1, None, horizon)
+        expect_close(found[last], rewards[last], "the last tick of every segment")
+        rows = rewards.reshape(segments, horizon)
+        wanted = rows[:, ::-1].cumsum(1)[:, ::-1].ravel()
+        expect_close(found, wanted, "the rest of the segment's return at every tick")
+
+
+@check("12-discount")
+def discount(answer: Any) -> None:
+    """Judge `my_discount(push, stand)`: the first of 0, .01, .. .99 at which push is worth more."""
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        push = np.r_[-rng.uniform(0.1, 0.3, 4), np.zeros(16)]
+        stand = np.full(20, -rng.uniform(0.04, 0.09))
+        steps = np.arange(100) / 100
+        better = [((push - stand) * gamma ** np.arange(20)).sum() > 0 for gamma in steps]
+        name = "the smallest discount at which pushing is worth more"
+        expect_close(answer(push, stand), steps[int(np.argmax(better))], name)
+
+
+@check("12-plan")
+def plan(answer: Any) -> None:
+    """Judge `my_plan()`: waypoints (y, z), mm, that end in a strict touch with a return above -90.
+
+    The low level is u = tanh(20 (y + integral of y)); the start is that of the lesson.
+    """
+    points = answer()
+    way = numbers(points, (len(points or ()), 2), "the list of points (y, z)")
+    task, total, stage = PegPush(PUSH, num=1, seed=0), 0.0, 0
+    obs, layout = task.reset(), task.layout
+    for k in range(PUSH.ticks):
+        if k % PUSH.horizon == 0:
+            tip = 1e3 * (obs[0, layout["position"]] - BOX_TOP)
+            stage += bool(np.abs(tip[1:] - way[stage]).max() < 0.7 and stage < len(way) - 1)
+            step = 1e-3 * np.r_[-tip[0], way[stage] - tip[1:]]
+            obs = task.set_subgoal(np.r_[step, -obs[0, layout["rotation"]]][None])
+        u = np.tanh(20.0 * (obs[:, layout["latent"]] + obs[:, layout["integral"]]))
+        obs, reward, *_, info = task.step(u)
+        total += float(reward[0])
+    away = 1e3 * float(np.linalg.norm(obs[0, layout["goal"]] - obs[0, layout["position"]]))
+    expect(
+        info["success"][0],
+        f"the tip ends {away:.2f} mm from the target, at waypoint {stage + 1} of {len(way)}: "
+        "no strict touch",
+    )
+    expect(total > -90.0, f"a strict touch, with a return of {total:.0f}; wanted above -90")
+
+
+# ---- lesson 13: orders, the longest hold, what a limit can hold, a plant of one's own
+
+
+@check("13-order")
+def order(answer: Any) -> None:
+    """Judge `my_order(f_y)`: upper triangular in that order, None where two drive each other."""
+    rng = np.random.default_rng(0)
+    for n in (2, 3, 5, 6):
+        names = rng.permutation(n)
+        f_y = np.triu(rng.uniform(0.5, 1.5, (n, n)) * (rng.random((n, n)) < 0.6))[names][:, names]
+        found = answer(f_y.copy())
+        expect(found is not None, f"an order exists for {f_y.round(1).tolist()}")
+        found = [int(i) for i in found]
+        expect(sorted(found) == list(range(n)), f"{found} is no order of {n} signals")
+        below = np.tril(f_y[found][:, found], -1)
+        expect(not below.any(), f"in the order {found} a signal still drives one after it")
+    ring = np.array([[-1.0, 1.0, 0.0], [0.0, -1.0, 1.0], [1.0, 0.0, -1.0]])
+    expect(answer(ring) is None, "in a ring of three everybody is driven: there is no order")
+
+
+@check("13-hold")
+def hold(answer: Any) -> None:
+    """Judge `my_hold(proved, low, high)`: the largest proved h to 1 %, with few questions."""
+    for edge, low, high in ((0.37, 0.05, 3.0), (2.9, 0.05, 3.0), (0.051, 0.05, 3.0)):
+        asked: list[float] = []
+
+        def proved(h: float, edge: float = edge, asked: list[float] = asked) -> bool:
+            asked.append(h)
+            return h <= edge
+
+        found = float(numbers(answer(proved, low, high), (), "the hold"))
+        expect(found <= edge, f"{found:.4g} s is not proved, the edge is at {edge:.4g} s")
+        expect(found >= 0.99 * edge, f"{found:.4g} s falls short of {edge:.4g} s by over 1 %")
+        expect(len(asked) <= 30, f"{len(asked)} questions, wanted at most 30")
+
+
+@check("13-angle")
+def angle(answer: Any) -> None:
+    """Judge `my_angle(limit)`: 3 limit = 15 sin(angle), 90 degrees where it always suffices."""
+    for limit in (0.5, 2.0, 4.9):
+        wanted = np.arcsin(3 * limit / 15)
+        expect_close(answer(limit), wanted, f"the angle that {limit} Nm can hold")
+    for limit in (5.0, 8.0):
+        expect_close(answer(limit), np.pi / 2, f"with {limit} Nm every angle up to 90 degrees:")
+
+
+@check("13-own")
+def own(answer: Any) -> None:
+    """Judge `my_plant()`: f, y, u, floor, cap; not linear, n >= 2, certified in the middle."""
+    found = answer()
+    five = isinstance(found, tuple) and len(found) == 5
+    expect(five, "wanted five things: f, y, u, floor and cap")
+    f, y, u, floor, cap = found
+    plant = Plant.from_function(f, y=y, u=u)
+    expect(plant.n >= 2, f"wanted at least two signals, got {plant.n}")
+    expect(not plant.constant, "this plant is linear: its Jacobians are the same everywhere")
+    fits = [option for option in transforms_that_fit(plant) if option.possible]
+    expect(fits, "no transforms fit; print transforms_that_fit(plant)")
+    middle, half = (plant.y_low + plant.y_high) / 2, (plant.y_high - plant.y_low) / 2
+    network = PositiveNetwork(plant.n, slope_min=floor, slope_max=cap)
+    policy = ModularPolicy(network, u0=plant.hold(middle))
+    box = Region(middle - half / 2, middle + half / 2, integral=0.5, points=5)
+    said = certify(policy, plant, region=box, transforms=fits[0].transforms, y_ref=middle)
+    expect(said, f"with {fits[0].name}: {said}")

@@ -1,0 +1,351 @@
+"""The policies of this package as Stable-Baselines3 policy classes (extra `cmc[sb3]`).
+
+    model = PPO(ContractingPolicy, env)
+    model = TD3(ContractingTD3Policy, env)
+
+is the whole change to a training with Stable-Baselines3: the (mean) action becomes `ModularPolicy`,
+with one positive network per dimension; the critic, the noise and the algorithm stay. `save` and
+`load` are Stable-Baselines3's own (a zip file that it reads with pickle: load only files that you
+trust); to keep weights without pickle, store `model.policy.state_dict()` with
+`cmc.store.save_checkpoint`.
+"""
+
+from __future__ import annotations
+
+import copy
+import gc
+from collections.abc import Sequence
+from operator import attrgetter
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+try:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.policies import ActorCriticPolicy
+    from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+    from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.td3.policies import Actor, TD3Policy
+except ImportError as error:
+    raise ImportError("cmc.sb3 needs Stable-Baselines3: pip install 'cmc[sb3]'") from error
+
+from cmc.policies import ConvexGradientNetwork, IndependentNetwork, ModularPolicy, PositiveNetwork
+
+__all__ = [
+    "BatchedVecEnv",
+    "ContractingPolicy",
+    "ContractingTD3Policy",
+    "ConvexGradientPolicy",
+    "IndependentPolicy",
+]
+Array = NDArray[np.float64]
+_FOREIGN = {"critic", "critic_target", "actor_target", "q_net", "lstm_actor", "quantile_net"}
+"""What algorithms other than PPO and its like ask their policies for."""
+
+
+class _Modular:
+    """What the policy classes share: an action that is a `ModularPolicy` on the observation.
+
+    The observation is s, the flat (n, 2) array of (z_i, integral of z_i), or holds it where
+    `layout` says; n is the size of the action.
+
+    Args:
+        observation_space: a Box of one axis.
+        action_space: a Box of one axis, n entries.
+        lr_schedule: of the optimizers, given by the algorithm.
+        network_kwargs: for the network, such as `slope_min`, `slope_max` and `joint_cap`.
+        layout: see `ModularPolicy`, as are `R`, `normalise` and `integral`.
+        R: diagonal of R where the observation does not hold it.
+        normalise: divide by |R_ii| in place of taking the sign alone.
+        integral: False hides the integrals.
+        net_arch: hidden layers by key: of the networks ("pi") and of the critic ("vf" or "qf").
+        **kwargs: for the class of Stable-Baselines3.
+    """
+
+    _where: ClassVar[str]  # for which algorithms the class is
+    _strange: ClassVar[str]  # an argument that tells another algorithm
+    _hidden: ClassVar[dict[str, tuple[int, ...]]]  # layers where net_arch says nothing
+    _more: ClassVar[tuple[str, ...]] = ()  # further arguments for `ModularPolicy`
+    _action: ClassVar[Any]  # where the `ModularPolicy` is
+    action_space: Any
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        lr_schedule: Any = None,
+        *,
+        network_kwargs: dict[str, Any] | None = None,
+        layout: dict[str, slice] | None = None,
+        R: Any = 1.0,
+        normalise: bool = False,
+        integral: bool = True,
+        net_arch: Any = None,
+        **kwargs: Any,
+    ) -> None:
+        if lr_schedule is None or self._strange in kwargs:
+            raise TypeError(f"{type(self).__name__} {self._where}")
+        _check_spaces(observation_space, action_space, layout)
+        sizes: dict[str, Sequence[int]] = dict(self._hidden)
+        if net_arch is not None:  # as in Stable-Baselines3, a key left out means no hidden layer
+            both = net_arch if isinstance(net_arch, dict) else dict.fromkeys(sizes, net_arch)
+            sizes = {name: both.get(name, ()) for name in sizes}
+        self._modular = {"layout": layout, "R": R, "normalise": normalise, "integral": integral}
+        self._modular |= {name: kwargs.pop(name) for name in self._more if name in kwargs}
+        self._asked = {
+            **self._modular,
+            "network_kwargs": dict(network_kwargs or {}),
+            "net_arch": {name: list(layers) for name, layers in sizes.items()},
+        }
+        super().__init__(
+            observation_space, action_space, lr_schedule, self._their_sizes(), **kwargs
+        )  # type: ignore[call-arg]
+
+    def _their_sizes(self) -> Any:
+        """Hidden layers as the class of Stable-Baselines3 builds them."""
+        return self._asked["net_arch"]
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), **self._asked}  # type: ignore[misc]
+
+    def jacobian(self, s: Tensor) -> Tensor:
+        """Slopes of the network, before sign rule and any tanh: s (..., n, 2) to (..., n, 2)."""
+        return self._action(self).jacobian(s)
+
+
+class _ActorCritic(_Modular, ActorCriticPolicy):
+    """Gaussian policy whose mean is a `ModularPolicy`; takes its `u0`, the center, as well."""
+
+    _where = (
+        "is for PPO, A2C and their like, which ask a policy for a Gaussian action and a value; "
+        "for TD3 and DDPG there is ContractingTD3Policy"
+    )
+    _strange, _more, _action = "n_critics", ("u0",), attrgetter("action_net")
+    _hidden: ClassVar = {"pi": (32, 32), "vf": (64, 64)}
+    network: ClassVar[Any]
+
+    def _their_sizes(self) -> Any:
+        return {"pi": [], "vf": self._asked["net_arch"]["vf"]}  # the mean sees the observation
+
+    def _build(self, lr_schedule: Any) -> None:
+        super()._build(lr_schedule)
+        hidden, kwargs = self._asked["net_arch"]["pi"], self._asked["network_kwargs"]
+        hidden = hidden[0] if self.network is ConvexGradientNetwork else hidden
+        network = self.network(self.action_space.shape[0], hidden=hidden, **kwargs)
+        self.action_net = ModularPolicy(network, **self._modular)
+        self.optimizer = self.optimizer_class(  # again, because a module was replaced
+            self.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
+            **self.optimizer_kwargs,
+        )
+
+    @property
+    def actor(self) -> ModularPolicy:
+        """The mean as a policy of this package."""
+        assert isinstance(self.action_net, ModularPolicy)
+        return self.action_net
+
+    def on_signals(self) -> Any:
+        """The mean as a function of the plain s: behind the algorithm's VecNormalize, if any."""
+        found = _normalisation(self)
+        return self.actor if found is None else _OnSignals(self.actor, found)
+
+    def slope_bounds(self) -> tuple[Array, Array]:
+        """Guaranteed interval of the slopes' magnitude, (n, 2) each."""
+        return self.actor.slope_bounds()
+
+    def __getattr__(self, name: str) -> Any:
+        if name in _FOREIGN:
+            raise AttributeError(f"{type(self).__name__} {self._where}: it has no {name!r}")
+        return super().__getattr__(name)
+
+
+class ContractingPolicy(_ActorCritic):
+    """One positive network per dimension: the slopes have the signs that contraction asks for."""
+
+    network = PositiveNetwork
+
+
+class IndependentPolicy(_ActorCritic):
+    """One unconstrained network per dimension: the baseline that differs in the signs only."""
+
+    network = IndependentNetwork
+
+
+class ConvexGradientPolicy(_ActorCritic):
+    """P and I terms as gradients of convex networks (arXiv 2305.17777); one size of "pi" counts."""
+
+    network = ConvexGradientNetwork
+
+
+class ContractingTD3Policy(_Modular, TD3Policy):
+    """TD3 and DDPG with one positive network per dimension: a_i = -sign(R_ii) tanh(pi_i).
+
+    Stable-Baselines3 scales actions from [-1, 1] to the action space. The tanh saturates, so slopes
+    have the right sign and a cap but no floor: `certify` answers in a region.
+    """
+
+    _where = (
+        "is for TD3 and DDPG, whose actions have no distribution of their own; for PPO and A2C "
+        "there is ContractingPolicy"
+    )
+    _strange, _action = "use_sde", attrgetter("actor.mu")
+    _hidden: ClassVar = {"pi": (32, 32), "qf": (256, 256)}
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        """Build the actor, or its slow copy."""
+        actor = super().make_actor(features_extractor)
+        hidden, kwargs = self._asked["net_arch"]["pi"], self._asked["network_kwargs"]
+        network = PositiveNetwork(self.action_space.shape[0], hidden=hidden, **kwargs)
+        actor.mu = ModularPolicy(network, squash=True, **self._modular)  # type: ignore[assignment]
+        return actor.to(self.device)
+
+    def on_signals(self) -> _OnSignals:
+        """The actor as a function of the plain s, scaled to the action space."""
+        return _OnSignals(self._action(self), _normalisation(self), self.action_space)
+
+    def slope_bounds(self) -> tuple[Array, Array]:
+        """Interval of the slopes' magnitude in the scaled action, (n, 2) each, from 0."""
+        return self.on_signals().slope_bounds()
+
+
+def _check_spaces(
+    seen: spaces.Space[Any], action: spaces.Space[Any], layout: dict[str, slice] | None
+) -> None:
+    """Refuse spaces that hold no (n, 2) signals for n actions, or a layout that does not fit."""
+    if not isinstance(action, spaces.Box) or len(action.shape) != 1:
+        raise ValueError(f"wanted actions in a Box of one axis; got {action}")
+    n, shape = action.shape[0], seen.shape or ()
+    if layout is None and shape != (2 * n,):
+        raise ValueError(
+            f"wanted observations of shape ({2 * n},), (z_i, integral of z_i) for each of "
+            f"{n} actions, or a layout; got {seen.shape}"
+        )
+    wanted = {"s": 2 * n, "R": n, "T_a": n * n}
+    for name, part in (layout or {}).items():
+        inside = range(*part.indices(shape[0])) if len(shape) == 1 else range(0)
+        if name in wanted and (len(inside) != wanted[name] or (part.stop or 0) > shape[0]):
+            raise ValueError(
+                f"layout: {name!r} needs {wanted[name]} numbers for {n} actions, got {part} of an "
+                f"observation of shape {shape}"
+            )
+
+
+def _normalisation(policy: nn.Module) -> Any:
+    """VecNormalize of the algorithm that holds a policy, if it scales observations; else None."""
+    holders = gc.get_referrers(policy)
+    for part in [part for part in holders if isinstance(part, dict)]:  # attributes of something
+        holders += [x for x in gc.get_referrers(part) if getattr(x, "__dict__", None) is part]
+    algorithms = [holder for holder in holders if isinstance(holder, BaseAlgorithm)]
+    found = [algorithm.get_vec_normalize_env() for algorithm in algorithms]
+    return next((env for env in found if env is not None and env.norm_obs), None)
+
+
+class _OnSignals:
+    """A `ModularPolicy` as it acts in a loop: w pi((s - mean) / std), or w tanh(pi(...)).
+
+    VecNormalize (`scales`, or None) gives mean and std and clips: its slopes are 1/std times as
+    large, and vanish where it clips. An off-policy algorithm scales actions from [-1, 1] to the
+    action space (`box`, or None): w is half its width, its middle joins `u0`.
+    """
+
+    def __init__(
+        self, policy: ModularPolicy, scales: Any = None, box: spaces.Box | None = None
+    ) -> None:
+        if scales is not None and set(policy.layout) != {"s"}:
+            raise ValueError("VecNormalize scales T_a and R as well: the policy sees wrong ones")
+        self.n, self.layout, self.normalise = policy.n, policy.layout, policy.normalise
+        self.integral, self.squash, self.R = policy.integral, policy.squash, policy.R.numpy()
+        low, high = (-1.0, 1.0) if box is None else (box.low.astype(float), box.high.astype(float))
+        self.half, self.u0 = (high - low) / 2, (high + low) / 2 + policy.u0.numpy()
+        self.network = copy.deepcopy(policy.network).double()
+        self.mean, self.std, self.clip = 0.0, np.ones((self.n, 2)), np.inf
+        if scales is not None:
+            part, shape = policy.layout["s"], (self.n, 2)
+            self.mean = scales.obs_rms.mean[part].reshape(shape)
+            self.std = np.sqrt(scales.obs_rms.var[part] + scales.epsilon).reshape(shape)
+            self.clip = float(scales.clip_obs)
+        self.bounds = policy.slope_bounds()
+
+    def pi(self, s: Array) -> Array:
+        """The action before the sign rule, on the plain signals, (..., n, 2) to (..., n)."""
+        seen = np.clip((s - self.mean) / self.std, -self.clip, self.clip)
+        seen = seen * [1.0, float(self.integral)]
+        like = next(self.network.parameters())
+        value = self.network(like.new_tensor(seen)).detach().numpy()
+        return np.asarray(self.half * (np.tanh(value) if self.squash else value))
+
+    def slope_bounds(self) -> tuple[Array, Array]:
+        """Slopes' magnitude, (n, 2) each; from 0 where something clips or saturates."""
+        low, high = (np.asarray(self.half)[..., None] * b / self.std for b in self.bounds)
+        return low * (np.isinf(self.clip) and not self.squash), high
+
+
+class BatchedVecEnv(VecEnv):
+    """A batched Gymnasium vector environment, one that restarts in the same step, as a `VecEnv`."""
+
+    def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
+        if mode != AutoresetMode.SAME_STEP:
+            raise ValueError(
+                "wanted a vector environment that restarts in the same step (autoreset_mode="
+                f"AutoresetMode.SAME_STEP), as Stable-Baselines3 expects; got {mode}"
+            )
+        self.env = env
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        self._seed: int | None = None
+        self._actions: Any = None
+        self._return, self._length = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=int)
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Use `seed` at the next reset."""
+        self._seed = seed
+        return [seed] * self.num_envs
+
+    def reset(self) -> Any:
+        """Start all trajectories."""
+        observation, _ = self.env.reset(seed=self._seed)
+        self._seed = None
+        self._return[:], self._length[:] = 0.0, 0
+        return observation
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Keep the actions for `step_wait`."""
+        self._actions = actions
+
+    def step_wait(self) -> Any:
+        """Step; what ended reports its last observation and its return ("episode")."""
+        observation, reward, terminated, truncated, info = self.env.step(self._actions)
+        done = terminated | truncated
+        self._return += reward
+        self._length += 1
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for index in np.flatnonzero(done):
+            infos[index] = {
+                "terminal_observation": info["final_obs"][index],
+                "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
+                "episode": {"r": float(self._return[index]), "l": int(self._length[index])},
+            }
+        self._return[done], self._length[done] = 0.0, 0
+        return observation, np.asarray(reward, dtype=np.float32), done, infos
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The batched environment's attribute, once for each trajectory asked for."""
+        return [getattr(self.env, attr_name)] * len(list(self._get_indices(indices)))
+
+    def _refuse(self, *_: Any, **__: Any) -> Any:
+        raise NotImplementedError("trajectories of a batch share their attributes and methods")
+
+    set_attr = env_method = _refuse
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """No trajectory of a batch is wrapped."""
+        return [False] * len(list(self._get_indices(indices)))
