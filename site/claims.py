@@ -128,7 +128,7 @@ def share_grows(name: str, study: str = "peg_touch") -> Answer:
         f"{first:.2f} % at episode {begin:,}, {last:.2f} % at {end:,}: "
         f"{row['mean']:+.2f} points [{row['low']:.2f}, {row['high']:.2f}]"
     )
-    return Answer(text, HOLDS if row["low"] > 0 else FAILS if row["mean"] < 1.0 else OPEN)
+    return Answer(text, HOLDS if row["low"] > 0 else FAILS if row["high"] <= 0 else OPEN)
 
 
 def stays_zero(name: str, study: str = "peg_touch") -> Answer:

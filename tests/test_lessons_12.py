@@ -214,6 +214,18 @@ def test_the_planner_was_the_bottleneck(now):
     assert now.groupby("method").seed.nunique()[["control", "td3_corrected"]].tolist() == [5, 5]
 
 
+def test_lengths_and_impacts_are_said(now):
+    steps = now.groupby("method").step.max()
+    assert steps["ctd3"] == 600_000
+    assert set(steps.drop("ctd3")) == {480_000}
+    more = at(tidy("peg_push_seeds_5_9"))
+    assert (more.step.max(), more.success.min(), more.success.max()) == (480_000, 0.95, 1.0)
+    largest = now.groupby("method").largest_N.max()
+    assert round(largest["ctd3"]) == 97
+    assert round(largest[["td3_corrected", "ctd3_positive"]].max()) == 120
+    assert largest[["frozen", "control"]].max() < 12
+
+
 def test_earlier_runs_do_not_touch_reliably(earlier):
     assert earlier.groupby("method").success.mean().max() < 0.65
     returns = earlier.groupby("method")["return"].mean().round()
