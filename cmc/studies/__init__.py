@@ -14,11 +14,9 @@ WHERE = {
     "peg_touch_2ms": "peg_touch",
     "peg_touch_5ms": "peg_touch",
     "peg_maze": "peg_maze",
-    "peg_maze_tuned": "peg_maze",
     "peg_maze_stiff": "peg_maze",
     "peg_maze_paper_sizes": "peg_maze",
     "peg_push": "peg_push",
-    "peg_push_half": "peg_push",
     "peg_push_contact_x0.4": "peg_push",
     "peg_push_contact_x4": "peg_push",
 }

@@ -133,25 +133,10 @@ STUDY = Study(
 )
 
 
-HALF = replace(
-    STUDY.variant(
-        "peg_push_half",
-        "peg push by an earlier scheme: discount .5, and slopes that start at 20, set by hand",
-        hierarchy=HierarchyConfig(high_noise_end=0.05),
-        planner={"discount": 0.5, "target_rate": 0.005, "pull": 0.0},
-        ppo=PPOConfig(gamma=0.5, epochs=10, learning_rate=1e-3),
-        relative=False,
-        start_gain=20.0,
-    ),
-    length=1_000_000,
-    every=100_000,
-)
-
-
 def under(scale: float) -> Study:
-    """The earlier scheme trained, and tested, under other contact."""
-    name, about = f"peg_push_contact_x{scale:g}", f"peg_push_half learned under contact x {scale:g}"
-    return replace(HALF.variant(name, about, task_class=scaled(scale)), tests=TESTS)
+    """The study trained, and tested, under other contact."""
+    name, about = f"peg_push_contact_x{scale:g}", f"peg_push learned under contact x {scale:g}"
+    return replace(STUDY.variant(name, about, task_class=scaled(scale)), tests=TESTS)
 
 
-VARIANTS = {study.name: study for study in (HALF, under(0.4), under(4.0))}
+VARIANTS = {study.name: study for study in (under(0.4), under(4.0))}
