@@ -13,7 +13,7 @@ from cmc.results import against, at, compare, holm, share, spread, tidy
 
 SHIPPED = sorted(path.stem for path in store.asset("results").glob("*.csv"))
 STUDIES = [name for name in SHIPPED if not name.endswith(tuple(results.TABLES))]
-PUSH = at(tidy("peg_push_half"))
+PUSH = at(tidy("peg_push"))
 
 
 def table(**arms: list[float]) -> pd.DataFrame:
@@ -76,7 +76,7 @@ def test_holm_by_hand_and_over_the_comparisons_named() -> None:
 
 
 def test_pooling_is_refused() -> None:
-    data = tidy("peg_push_half")
+    data = tidy("peg_push")
     with pytest.raises(ValueError, match="one row for each seed in a group by method, got several"):
         share(data)
     with pytest.raises(ValueError, match="ctd3: wanted one row for each seed"):
@@ -154,6 +154,6 @@ def test_what_is_written_is_read_again(tmp_path: object) -> None:
 
 def test_unknown_tables_and_studies_are_named() -> None:
     with pytest.raises(ValueError, match="table: wanted one of tests, curves"):
-        tidy("peg_push_half", "nothing")
+        tidy("peg_push", "nothing")
     with pytest.raises(ValueError, match=r"no results 'nobody\.csv' are shipped; there are"):
         tidy("nobody")
