@@ -210,11 +210,6 @@ def table():
     return at(tidy("peg_maze").query("test == 'nominal'"))
 
 
-@pytest.fixture(scope="module")
-def tuned():
-    return at(tidy("peg_maze_tuned").query("test == 'nominal'"))
-
-
 def by(table, method, key="success"):
     return table[table.method == method][key]
 
@@ -237,19 +232,16 @@ def test_learning_pays_from_an_untuned_start(table):
     assert round(100 * by(table, "gain").mean()) == 99
 
 
-def test_nothing_is_left_to_learn_from_a_slope_set_by_hand(tuned):
-    assert by(tuned, "ctd3").min() == by(tuned, "frozen").min() == 1.0
-    found = compare(tuned, [("ctd3", "frozen", "return")])
-    assert found.low.iloc[0] < 0 < found.high.iloc[0]
+def test_little_is_left_to_learn_from_a_slope_set_by_hand(table):
+    assert by(table, "ctd3_tuned").min() == by(table, "frozen_tuned").min() == 1.0
 
 
-def test_the_others_end_low_so_far(table, tuned):
-    names = ("td3_corrected", "ctd3_positive", "control")
-    assert [round(100 * by(table, name).mean()) for name in names] == [9, 2, 21]
-    assert (by(table, "control") > 0.5).sum() == 1
-    steps = table.groupby("method").step.max()
-    assert steps[["td3_corrected", "ctd3_positive"]].tolist() == [100_000, 140_000]
-    assert by(tuned, "ctd3_paper").max() == 0.0
+def test_a_critic_is_a_poor_teacher_at_this_length(table):
+    names = ("td3_corrected", "td3", "ctd3_positive", "ctd3_paper", "control")
+    assert [round(100 * by(table, name).mean()) for name in names] == [20, 10, 2, 0, 21]
+    assert all((by(table, name) > 0.5).sum() == 1 for name in ("td3_corrected", "control"))
+    ours = table[~table.method.str.startswith("hiro")]
+    assert ours.step.unique().tolist() == [140_000]
 
 
 def test_hiro_is_compared_with_a_rigid_peg(table):

@@ -68,8 +68,6 @@ LEARNING = {
 @pytest.mark.parametrize("text", LEARNING)
 def test_success_and_return_are_those_of_the_table_over_seeds(text: str) -> None:
     ours, (study, name) = FOUND[text].ours, LEARNING[text]
-    if not raw(study, name):  # an arm of an earlier planner stands in
-        study = claims.EARLIER[study]
     success, returns = (by_seed(study, name, key) for key in ("success", "return"))
     for part, values in (
         (ours.split(", return")[0], [100 * value for value in success]),
@@ -155,7 +153,6 @@ GOOD, BAD = [0.9] * 5, [0.1] * 5
         (arms(ctd3=([1, 1, 0, 0, 0], -50, 300), control=([1, 0, 0, 0, 0], -50, 300)), HOLDS, HOLDS),
         # C-TD3 counts only up to the rival's length
         (arms(ctd3=(GOOD, -50, 900), control=(BAD, -600, 300)), SHORT, HOLDS),
-        (arms(ctd3=(GOOD, -50, 300)), OPEN, HOLDS),
     ],
 )  # fmt: skip
 def test_one_rule_for_all_arms(monkeypatch, table, control, ctd3) -> None:
