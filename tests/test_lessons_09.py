@@ -144,17 +144,31 @@ def test_claim_of_growing_shares(table):
         assert round(100 * of(table, "cppo", 5000, h=h).oscillation.mean()) == share
 
 
+def late_shares(study):
+    """Percent that oscillates or drifts by method, episode and seed, from episode 5000 on."""
+    late = tidy(study).query("test == 'nominal' and episode >= 5000")
+    unstable = 100 * (late.oscillation + late.drift)
+    return unstable.groupby([late.method, late.episode, late.seed]).sum()
+
+
 def test_claims_at_two_milliseconds():
-    late = tidy("peg_touch_2ms").query("test == 'nominal' and episode >= 5000")
-    share = (
-        100 * (late.oscillation + late.drift).groupby([late.method, late.episode, late.seed]).sum()
-    )
-    (only,) = share["cppo"][share["cppo"] > 0]
-    assert round(only, 1) == 0.6
+    share = late_shares("peg_touch_2ms")
+    assert share["cppo"].max() == 0.0
     raw = share["ppo_raw"].unstack()
-    assert (round(raw.loc[5000].mean(), 2), round(raw.loc[10000].mean(), 2)) == (0.04, 0.32)
-    assert (raw.loc[10000] > 0).sum() == 2
-    assert raw.index.max() == 10000
+    assert (raw.index.min(), raw.index.max()) == (5000, 15_000)
+    assert round(raw.max().max(), 1) == 5.1
+    assert (round(raw.loc[5000].mean(), 2), round(raw.loc[15_000].mean(), 2)) == (0.37, 1.07)
+    (only,) = (again := late_shares("peg_touch_2ms_10000")["cppo"])[again > 0]
+    assert round(only, 1) == 0.6
+
+
+def test_claims_at_five_milliseconds():
+    share = late_shares("peg_touch_5ms")
+    cppo = share["cppo"]
+    assert sorted(cppo[cppo > 0].round(1)) == [0.1, pytest.approx(8.6, abs=0.06)]
+    assert len(cppo) == 55
+    raw = share["ppo_raw"].unstack()
+    assert (round(raw.loc[5000].mean(), 2), round(raw.loc[15_000].mean(), 2)) == (0.22, 1.51)
 
 
 def test_claim_of_generalization(table):
