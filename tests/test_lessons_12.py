@@ -174,23 +174,22 @@ def by(table, method, key="success"):
 
 def test_learning_pays_in_speed_and_not_in_success(now):
     learned, frozen = (by(now, name) for name in ("ctd3", "frozen"))
-    assert learned.min() > 0.85
-    assert min(learned.mean(), frozen.mean()) > 0.9
-    assert frozen.mean() >= learned.mean() - 0.01
+    assert sorted(round(100 * share) for share in learned) == [82, 99, 100, 100, 100]
+    assert (round(100 * learned.mean()), frozen.min()) == (96, 1.0)
     fast, slow = (by(now, name, "return") for name in ("ctd3", "frozen"))
     assert fast.min() > slow.max()
     assert 2.5 < slow.mean() / fast.mean() < 4.0
-    assert -40 < fast.mean() < -28
+    assert round(fast.mean()) == -35
     rivals = ("frozen", "control", "td3_corrected", "ctd3_positive")
     named = [("ctd3", other, "success") for other in rivals] + [
         ("ctd3", other, "return") for other in ("frozen", "gain")
     ]
     found = compare(now, named)
     assert found.p_holm.iloc[:4].min() > 0.05
-    assert round(100 * found.difference.iloc[3]) == 59
+    assert round(100 * found.difference.iloc[3]) == 57
     assert found.p_holm.round(3).iloc[[3, 4]].tolist() == [0.079, 0.048]
     gap = found.iloc[5]
-    assert [round(gap[k], 1) for k in ("difference", "low", "high")] == [0.3, -2.6, 2.8]
+    assert [round(gap[k], 1) for k in ("difference", "low", "high")] == [-1.8, -5.5, 1.3]
     assert by(now, "gain").min() == 1.0
     assert now[now.method == "ctd3"].step.max() <= 600_000
     assert by(now, "ctd3", "largest_N").max() > 30
@@ -213,10 +212,13 @@ def test_lengths_and_impacts_are_said(now):
     steps = now.groupby("method").step.max()
     assert steps["ctd3"] == 600_000
     assert set(steps.drop("ctd3")) == {480_000}
-    more = at(tidy("peg_push_seeds_5_9"))
-    assert (more.step.max(), more.success.min(), more.success.max()) == (480_000, 0.95, 1.0)
+    for table, length, least in (("seeds_5_9", 480_000, 0.95), ("again", 600_000, 0.96)):
+        more = at(tidy(f"peg_push_{table}"))
+        assert (more.step.max(), more.success.min(), more.success.max()) == (length, least, 1.0)
+    early = at(tidy("peg_push").query("test == 'nominal'"), 480_000).query("method == 'ctd3'")
+    assert (round(100 * early.success.mean()), early.episodes.unique().tolist()) == (98, [20])
     largest = now.groupby("method").largest_N.max()
-    assert round(largest["ctd3"]) == 97
+    assert round(largest["ctd3"]) == 98
     assert round(largest[["td3_corrected", "ctd3_positive"]].max()) == 120
     assert largest[["frozen", "control"]].max() < 12
 

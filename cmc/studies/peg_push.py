@@ -19,7 +19,8 @@ What the paper gives is in `cmc.envs.peg_push` and in the table `tab:para`. Devi
    them where it has a slope. Critics have 128, 128 units.
 6. Low level: as in the maze (`cmc.studies.peg_maze`, 6); PPO/Control as there (8), discount .9.
 7. 3 to 5 were chosen in trainings with seeds 0 to 4. Five more seeds of C-TD3, 480,000 steps each,
-   are in the table `peg_push_seeds_5_9`.
+   are in the table `peg_push_seeds_5_9`; another run of seeds 0 to 4, in which only rounding
+   differed, is in `peg_push_again`.
 
 The contact of the simulator is soft; how much of the result it owes to that is tested too. MuJoCo
 (its documentation, chapter Modeling, section "Solver parameters") resolves a contact of depth r by
