@@ -181,7 +181,7 @@ def region(
 
 def _axes(ax: Axes | None, size: tuple[float, float] = (7.0, 3.6)) -> Axes:
     """`ax`, or the axes of a new figure of a size in inches."""
-    return panels(width=size[0], height=size[1])[1][0, 0] if ax is None else ax
+    return ax or panels(width=size[0], height=size[1])[1][0, 0]
 
 
 def _finish(

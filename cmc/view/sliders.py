@@ -107,16 +107,15 @@ def slider(
         raise ValueError(f"wanted finite low <= start <= high, got {low}, {start}, {high}")
     if not 0 < step <= high - low:
         raise ValueError(f"wanted 0 < step <= {high - low}, got {step}")
-    if not whole or not isinstance(step, int):
-        whole, low, high, start, step = False, float(low), float(high), float(start), float(step)
-    count = int(np.ceil((high - low) / step - 1e-9)) + 1
-    steps = {min(low + k * step, high) for k in range(count)}
-    near = {v for v in steps if abs(v - start) < 1e-9 * (high - low)}
+    whole = whole and isinstance(step, int)
+    low, high, start, step = map(int if whole else float, (low, high, start, step))
+    steps = [low + k * step for k in range(int(np.ceil((high - low) / step - 1e-9)))]
+    values = [v for v in (*steps, high) if abs(v - start) >= 1e-9 * (high - low)]
     digits = max(0, int(np.ceil(-np.log10(step) - 1e-9)))
-    more: dict[str, Any] = {"min": low, "max": high, "step": step}
+    more = {"min": low, "max": high, "step": step}
     more["readout_format"] = "d" if whole else f".{digits}f"
     kind = widgets.IntSlider if whole else widgets.FloatSlider
-    return Control(kind, start, sorted(steps - near | {start}), label, unit, more)
+    return Control(kind, start, sorted([*values, start]), label, unit, more)
 
 
 def choice(*options: Any, start: Any = None, label: str = "") -> Control:
@@ -193,12 +192,11 @@ class Explorer(widgets.VBox):
 
     def _refresh(self) -> None:
         self._wanted = None
-        values = self.values
         try:
             self.evaluate()
         except Exception as error:
             # A handler's exception would reach nobody: it is shown and kept instead.
-            at = ", ".join(f"{name} = {value}" for name, value in values.items())
+            at = ", ".join(f"{name} = {value}" for name, value in self.values.items())
             self.errors.append(f"{_said(error)} (at {at})")
             self.canvas.error = self.errors[-1]
 
@@ -235,15 +233,14 @@ def explore(
     canvas = Canvas(panels, describe, time)
     made = Explorer(callback, canvas, controls, slow)
     if os.environ.get("CMC_EXPORT", "0") not in ("", "0") if frames is None else frames:
-        starts = [c.values.index(c.start) for c in controls.values()]
 
         def picture(*values: Any) -> dict[str, Any]:
             try:
-                data = callback(**dict(zip(controls, values, strict=True)))
-                return encode(panels, data, time)
+                return encode(panels, callback(**dict(zip(controls, values, strict=True))), time)
             except Exception as error:
                 return {"error": _said(error)}
 
+        starts = [c.values.index(c.start) for c in controls.values()]
         canvas.table = frame_table([c.values for c in controls.values()], starts, picture)
     return made
 
@@ -254,12 +251,10 @@ def _probes(controls: Mapping[str, Control], *, corners: bool) -> Iterator[dict[
     The start comes last, so that its picture is the one that stays.
     """
     start = {name: control.start for name, control in controls.items()}
-    for name, control in controls.items():
-        yield from ({**start, name: value} for value in control.probes)
-    several = 1 < len(controls) <= 3
-    if corners and several and np.prod([len(c.probes) for c in controls.values()]) <= 16:
-        for ends in itertools.product(*(c.probes for c in controls.values())):
-            yield dict(zip(controls, ends, strict=True))
+    yield from ({**start, name: value} for name, c in controls.items() for value in c.probes)
+    ends = [c.probes for c in controls.values()]
+    if corners and 1 < len(ends) <= 3 and np.prod([len(values) for values in ends]) <= 16:
+        yield from (dict(zip(controls, corner, strict=True)) for corner in itertools.product(*ends))
     yield start
 
 
