@@ -24,6 +24,7 @@ import os
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from time import monotonic
 from typing import Any
 
 import ipywidgets as widgets
@@ -41,7 +42,7 @@ from cmc.view.picture import points as points
 from cmc.view.picture import rule as rule
 from cmc.view.picture import shade as shade
 
-_DEBOUNCE = 0.004  # s: changes that wait in the kernel's queue are answered by one frame
+_DEBOUNCE = 0.004  # s: changes that came while a picture was made are answered by one more
 
 
 @dataclass(frozen=True)
@@ -149,6 +150,7 @@ class Explorer(widgets.VBox):
         self.callback, self.canvas = callback, canvas
         self.errors: list[str] = []
         self._wanted: asyncio.TimerHandle | None = None
+        self._answered = 0.0  # when the last picture was done
         self.controls = {name: c.widget(name, slow=slow) for name, c in controls.items()}
         for values in _probes(controls, corners=not slow):
             self.evaluate(**values)  # raises: a broken callback fails the cell
@@ -182,12 +184,15 @@ class Explorer(widgets.VBox):
             widget.value = self._first[name]
 
     def _changed(self, _: Any) -> None:
+        if self._wanted is not None:
+            return
         try:
             loop = asyncio.get_running_loop()
         except RuntimeError:
-            self._refresh()
-            return
-        if self._wanted is None:
+            loop = None
+        if loop is None or monotonic() - self._answered > _DEBOUNCE:
+            self._refresh()  # at once: nothing has waited
+        else:
             self._wanted = loop.call_later(_DEBOUNCE, self._refresh)
 
     def _refresh(self) -> None:
@@ -199,6 +204,7 @@ class Explorer(widgets.VBox):
             at = ", ".join(f"{name} = {value}" for name, value in self.values.items())
             self.errors.append(f"{_said(error)} (at {at})")
             self.canvas.error = self.errors[-1]
+        self._answered = monotonic()
 
 
 def explore(
