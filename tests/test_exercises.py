@@ -187,7 +187,7 @@ SLIPS = [
     ("09-slope-cap", lambda k1, k2, tau, K, h: 1e-3, "the used share"),
     ("09-period", lambda k1, k2, tau, K: 0.001, "it is still calm"),
     ("09-period", lambda k1, k2, tau, K: 0.15, "it rattles already"),
-    ("10-torque", lambda M, J, h, d, p: J.T @ p + h, "the tip acceleration"),
+    ("10-torque", lambda M, J, h, d, p: J.T @ p + h, "the torque at"),
     ("10-torque", lambda M, J, h, d, p: M @ np.linalg.pinv(J) @ p + h, "counts twice"),
     ("10-torque", lambda M, J, h, d, p: M @ np.linalg.pinv(J) @ (p - d), "h is missing"),
     (
