@@ -108,7 +108,7 @@ def compare(
         def judge(answer: Any) -> None:
             for given, right, *slips in cases():
                 found, said = answer(*copy.deepcopy(given)), what.format(*given)
-                expect_close(found, right, said, *slips, **tolerances)
+                expect_close(found, right, said, slips[0] if slips else None, **tolerances)
 
         judge.__module__ = cases.__module__
         return _register(name, judge)

@@ -27,7 +27,7 @@ def rate() -> Iterator[Any]:
         [[-0.5, 2], [-2, -0.5]],
         [[0.25, 0], [5, -1]],
     ):
-        growth = np.linalg.eigvals(A).real.max()
+        growth = np.linalg.eigvals(np.array(A, float)).real.max()
         yield (np.array(A, float),), -growth, {"the sign is wrong: decay counts positive": growth}
 
 

@@ -172,10 +172,9 @@ def turned_tool(answer: Any) -> None:
         turn = np.array([[cos, -sin], [sin, cos]])
         found = answer(K, slope, angle)
         expect(found is not None and len(found) == 2, "return two matrices, T_y and T_a")
-        slips = {
-            "this is V: the corner of T_y = V^-1 has the other sign": [[1, 0], [-K * slope, 1]]
-        }
-        T_y = expect_close(found[0], [[1, 0], [K * slope, 1]], "T_y", slips)
+        V = np.array([[1.0, 0.0], [-K * slope, 1.0]])
+        slips = {"this is V: the corner of T_y = V^-1 has the other sign": V}
+        T_y = expect_close(found[0], np.linalg.inv(V), "T_y", slips)
         T_a = numbers(found[1], (2, 2), "T_a")
         expect_close(T_a.T @ T_a, np.eye(2), "T_a^T T_a")
         hint = "T_a turns the command once more; it has to turn it back"

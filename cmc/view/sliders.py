@@ -113,7 +113,7 @@ def slider(
     steps = [low + k * step for k in range(int(np.ceil((high - low) / step - 1e-9)))]
     values = [v for v in (*steps, high) if abs(v - start) >= 1e-9 * (high - low)]
     digits = max(0, int(np.ceil(-np.log10(step) - 1e-9)))
-    more = {"min": low, "max": high, "step": step}
+    more: dict[str, Any] = {"min": low, "max": high, "step": step}
     more["readout_format"] = "d" if whole else f".{digits}f"
     kind = widgets.IntSlider if whole else widgets.FloatSlider
     return Control(kind, start, sorted([*values, start]), label, unit, more)

@@ -114,7 +114,7 @@ def skins(model: mujoco.MjModel, groups: Sequence[int]) -> list[dict[str, Any]]:
             weight = model.skin_bonevertweight[rows].astype(np.float32)
             placed = {"body": int(model.skin_bonebodyid[b]), "rest": pose.tolist()}
             bones.append({**placed, "index": index, "weight": weight})
-        look = _surface(model, "skin", i, model.skin_face[face : face + model.skin_facenum[i]])
+        look = _surface(model, "skin", int(i), model.skin_face[face : face + model.skin_facenum[i]])
         rest = model.skin_vert[first : first + model.skin_vertnum[i]].astype(np.float32)
         found.append({**look, "corners": rest, "bones": bones})
     return [skin for skin in found if skin["opacity"] > 0]
@@ -141,7 +141,7 @@ def _flexes(model: mujoco.MjModel, groups: Sequence[int]) -> Iterator[_Soft]:
             elements = model.flex_elem[first : first + width * count].reshape(-1, width)
         radius = float(model.flex_radius[i]) if dim == 1 else None
         faces = elements if dim > 1 else _tube_faces(len(elements))
-        yield _surface(model, "flex", i, faces), partial(_flex, rows, elements.T, radius)
+        yield _surface(model, "flex", int(i), faces), partial(_flex, rows, elements.T, radius)
 
 
 def _flex(rows: slice, ends: Any, radius: float | None, data: mujoco.MjData) -> Array:
@@ -155,7 +155,7 @@ def _tendons(model: mujoco.MjModel, groups: Sequence[int]) -> Iterator[_Soft]:
     for i in np.flatnonzero(spatial & np.isin(model.tendon_group, groups)):
         most, radius = 2 * int(model.tendon_num[i]), float(model.tendon_width[i])
         yield (
-            _surface(model, "tendon", i, _tube_faces(most)),
+            _surface(model, "tendon", int(i), _tube_faces(most)),
             partial(_tendon, int(i), most, radius),
         )
 
