@@ -115,9 +115,9 @@ function tickText(value, log) {
     return Number.isInteger(value) ? `$10^{${power}}$` : (10 ** value).toPrecision(2);
   }
   if (value === 0 || Math.abs(value) < 1e-12) return "0";
-  const size = Math.abs(value);
-  if (size >= 1e5 || size < 1e-3) return value.toExponential(1).replace("e+", "e").replace("-", "−");
-  return String(+value.toPrecision(6)).replace("-", "−");
+  const size = Math.abs(value), short = +value.toPrecision(6);
+  const text = size >= 1e6 || size < 1e-3 ? short.toExponential() : String(short);
+  return text.replace("e+", "e").replaceAll("-", "−");
 }
 
 class Axes {
