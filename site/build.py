@@ -101,8 +101,9 @@ def results() -> str:
     """A table for each study: its last policies, test by test, and the files with all rows."""
 
     def words(values: Any) -> str:
-        few = f"{values.mean():.3g} [{values.min():.3g}, {values.max():.3g}]"
-        return "" if values.isna().all() else few
+        mean, low, high = (f"{v:.3g}" for v in (values.mean(), values.min(), values.max()))
+        few = mean if low == high else f"{mean} [{low}, {high}]"
+        return "" if values.isna().all() else few.replace("-", "\N{MINUS SIGN}")
 
     parts, files = [RESULTS], {}
     for file in sorted((ROOT / "assets" / "results").glob("*.csv")):

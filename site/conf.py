@@ -22,6 +22,7 @@ suppress_warnings = ["mystnb.unknown_mime_type", "myst.header", "ref.python"]
 # The notebooks come executed; static/widgets.js plays their widgets, no widget manager is loaded.
 nb_execution_mode = "off"
 nb_merge_streams = True
+nb_render_markdown_format = "myst"  # tables and mathematics in what a cell shows
 nb_mime_priority_overrides = [
     ("html", "application/vnd.jupyter.widget-view+json", 0),
 ]

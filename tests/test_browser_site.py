@@ -69,8 +69,9 @@ def test_no_page_fails_loads_from_elsewhere_or_is_too_wide_for_a_phone(opened, n
     page.close()
 
 
-def test_exercises_answer_without_a_traceback(site):
+def test_exercises_answer_without_a_traceback_and_tables_are_tables(site):
     text = (site / LESSON).read_text("utf-8")
+    assert re.search("<th[^>]*><p>in code", text)
     assert "exercises.check" in re.sub("<[^>]*>", "", text)
     assert "output traceback" not in text
 

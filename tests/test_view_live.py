@@ -1,6 +1,7 @@
-"""Live view: what it serves, to whom, and what it leaves behind."""
+"""What a notebook shows, and the live view: what it serves, to whom, what it leaves behind."""
 
 import asyncio
+import html as html_
 import socket
 import threading
 import time
@@ -16,6 +17,14 @@ from tornado.httpclient import HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
 
+@pytest.fixture(autouse=True)
+def served(monkeypatch, tmp_path):
+    """As in JupyterLab, whatever the tests run in; files go to an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("CMC_EMBED", "VSCODE_PID", "SERVER_SOFTWARE"):
+        monkeypatch.delenv(name, raising=False)
+
+
 @pytest.fixture(scope="module")
 def recording():
     return tumbled(mujoco.MjModel.from_xml_string(SCENE), 1)
@@ -28,6 +37,28 @@ def moved():
     data.qpos[0] = 0.25
     mujoco.mj_kinematics(data.model, data)
     return data
+
+
+def test_shown_in_a_notebook_as_a_frame_on_the_file(recording, tmp_path):
+    frame = recording.show("playback/tumble.html", height=300)
+    assert 'src="playback/tumble.html"' in frame._repr_html_()
+    assert (tmp_path / "playback/tumble.html").read_text() == recording.html()
+    for path in (tmp_path / "x.html", "../x.html"):
+        with pytest.raises(ValueError, match="relative"):
+            recording.show(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("", ""), ("CMC_EMBED", "1"), ("VSCODE_PID", "7"), ("SERVER_SOFTWARE", "voila/0.5")],
+)
+def test_embedded_without_a_path_or_a_server(recording, tmp_path, monkeypatch, name, value):
+    if name:
+        monkeypatch.setenv(name, value)
+    markup = recording.show("playback/tumble.html" if name else None)._repr_html_()
+    assert recording.html() in html_.unescape(markup)
+    assert 'sandbox="allow-scripts"' in markup
+    assert list(tmp_path.iterdir()) == []
 
 
 def refused(port, host="127.0.0.1"):

@@ -1,7 +1,6 @@
 """Playback without a browser: what is recorded, how it is drawn and packed."""
 
 import base64
-import html as html_
 import json
 import re
 
@@ -36,14 +35,6 @@ SCENE = """<mujoco><asset><material name="blue" rgba=".2 .6 .9 1"/>
 
 def load(xml):
     return mujoco.MjModel.from_xml_string(xml)
-
-
-@pytest.fixture(autouse=True)
-def served(monkeypatch, tmp_path):
-    """As in JupyterLab, whatever the tests run in; files go to an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    for name in ("CMC_EMBED", "VSCODE_PID", "SERVER_SOFTWARE"):
-        monkeypatch.delenv(name, raising=False)
 
 
 @pytest.fixture(scope="module")
@@ -104,8 +95,8 @@ def test_poses_equal_mujoco_s_and_static_bodies_are_not_stored(model, recording)
     assert recording.bodies == ["torso", "head|top", "arm", "body4"]
     for k in (0, 17, 39):
         data = at(model, qpos[k])
-        np.testing.assert_allclose(recording.poses[k, :, :3], data.xpos[1:], atol=1e-7)
-        np.testing.assert_allclose(recording.poses[k, :, 3:], data.xquat[1:], atol=1e-7)
+        place = np.c_[data.xpos, data.xquat][1:]
+        np.testing.assert_allclose(recording.poses[k], place, atol=1e-7)
         tip = data.site("tip").xpos
         np.testing.assert_allclose(recording.overlays[0]["points"][k], tip, atol=1e-12)
     assert model.nq not in {states.shape[1]}
@@ -123,14 +114,6 @@ def test_mocap_bodies_move_with_full_states():
         data.mocap_pos[0, 0] = 0.5 * k
         mujoco.mj_getState(model, data, row, spec)
     np.testing.assert_allclose(record(model, states, [0.0, 1.0]).poses[:, 0, 0], [0.0, 0.5])
-
-
-def test_capsule_surface_is_one_radius_from_its_axis(model, recording):
-    drawn = commands(recording, "set_object")[f"torso/geom{model.geom('chest').id}"]["object"]
-    points = np.array([[p["x"], p["y"]] for p in drawn["geometries"][0]["points"]])
-    nearest = np.stack([np.zeros(len(points)), np.clip(points[:, 1], -0.1, 0.1)], axis=1)
-    np.testing.assert_allclose(np.linalg.norm(points - nearest, axis=1), 0.07, atol=1e-12)
-    assert (np.diff(points[:, 1]) > 0).all()  # no fold, and normals that point outwards
 
 
 def look(drawn):
@@ -153,20 +136,17 @@ def test_colors_follow_mujoco_s_rule():
         assert look(drawn[f"geom{k}"]) == pytest.approx(rgba, abs=0.01)
 
 
-def test_goal_zones_of_the_model_are_taken_over():
+def test_sites_are_drawn_where_they_have_a_material():
     model = load(
         """<mujoco><asset><material name="goal" rgba="0 1 0 .4"/></asset><worldbody>
-        <body><joint/><geom size=".1"/></body>
-        <site name="zone" type="box" size=".1 .2 .3" pos="1 2 3" material="goal"/>
-        <site name="frame" size=".1"/></worldbody></mujoco>"""
+        <site type="box" size=".1 .2 .3" pos="1 2 3" material="goal"/>
+        <site size=".1"/></worldbody></mujoco>"""
     )
-    made = record(model, np.zeros((1, 1)), [0.0])
-    drawn = commands(made, "set_object")
-    assert "world/site1" not in drawn
-    assert drawn["world/site0"]["object"]["geometries"][0]["height"] == pytest.approx(0.4)
-    assert look(drawn["world/site0"]["object"])[3] == pytest.approx(0.4)
-    place = commands(made, "set_transform")["world/site0"]["matrix"]
-    assert place[12:15] == [1, 2, 3]
+    made = record(model, np.zeros((1, 0)), [0.0])
+    ((path, zone),) = commands(made, "set_object").items()
+    assert zone["object"]["geometries"][0]["height"] == pytest.approx(0.4)
+    assert look(zone["object"])[3] == pytest.approx(0.4)
+    assert commands(made, "set_transform")[path]["matrix"][12:15] == [1, 2, 3]
 
 
 def test_height_fields_lie_where_mujoco_has_them():
@@ -230,18 +210,6 @@ def test_page_loads_nothing_and_hostile_names_stay_text(model):
     assert "@@" not in re.sub(r"<script>.*?</script>", "", html, flags=re.S)
 
 
-def test_twenty_seconds_of_a_humanoid_s_worth_of_bodies_stay_below_three_megabytes():
-    bodies = "".join(
-        f'<body name="b{i}" pos="{i} 0 0"><joint/><geom type="capsule" size=".1 .2"/></body>'
-        for i in range(17)
-    )
-    model = load(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
-    qpos = np.random.default_rng(0).normal(size=(1001, model.nq))
-    recording = record(model, qpos, 0.02 * np.arange(1001), trails=["b1"])
-    assert len(recording.bodies) == 17
-    assert len(recording.html().encode()) < 3e6
-
-
 def test_overlays_are_broadcast_and_get_different_colors(model):
     path = np.array([[0, 0, 1], [np.nan] * 3, [0, 1, 1.0]])
     markers = {"goal": [0, 0, 1.0], "way": Marker(path, radius=0.01), "own": Marker(path)}
@@ -294,32 +262,9 @@ def test_default_camera_frames_every_solid_geom(model, recording):
 def test_own_cameras_replace_the_presets(model):
     mine = {"mine": Camera((1, 0, 0), (0, 0, 0))}
     assert tumbled(model, 2, cameras=mine).cameras == mine
-    assert around([1, 2, 3], 1.0, azimuth=0, elevation=0).position[1:] == pytest.approx((2, 3))
     for bad in (lambda: around([0, 0], 1.0), lambda: around([0, 0, 0], 0.0)):
         with pytest.raises(ValueError, match=r"center|radius"):
             bad()
-
-
-def test_shown_in_a_notebook_as_a_frame_on_the_file(recording, tmp_path):
-    frame = recording.show("playback/tumble.html", height=300)
-    assert 'src="playback/tumble.html"' in frame._repr_html_()
-    assert (tmp_path / "playback/tumble.html").read_text() == recording.html()
-    for path in (tmp_path / "x.html", "../x.html"):
-        with pytest.raises(ValueError, match="relative"):
-            recording.show(path)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("", ""), ("CMC_EMBED", "1"), ("VSCODE_PID", "7"), ("SERVER_SOFTWARE", "voila/0.5")],
-)
-def test_embedded_without_a_path_or_a_server(recording, tmp_path, monkeypatch, name, value):
-    if name:
-        monkeypatch.setenv(name, value)
-    markup = recording.show("playback/tumble.html" if name else None)._repr_html_()
-    assert recording.html() in html_.unescape(markup)
-    assert 'sandbox="allow-scripts"' in markup
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_cannot_be_drawn_is_named_and_the_rest_is_drawn(model, monkeypatch):

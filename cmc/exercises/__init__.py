@@ -1,6 +1,10 @@
 """What the exercises of the course are checked with.
 
-Checks live in `cmc/exercises/lessons_*.py` and are loaded when one of them is asked for:
+Checks live in `cmc/exercises/lessons_*.py` and are loaded when one of them is asked for. Most say
+what an answer is asked, what is right, and which slips deserve a hint; others what has to hold:
+
+    @compare("02-twice", "twice {0}")
+    def twice(): ...                # yields (arguments, right[, {hint: wrong}])
 
     @check("02-sign-rule")
     def sign_rule(answer): ...      # raises AssertionError, by `expect`, with a helpful sentence
@@ -11,10 +15,11 @@ the lesson.
 
 from __future__ import annotations
 
+import copy
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,9 +28,9 @@ Judge = Callable[[Any], None]
 
 CHECKS: dict[str, Judge] = {}
 """Checks that have been loaded, by name."""
-_FILES = {"00_04": range(5), "05_07": range(5, 8), "08_09": (8, 9), "10_13": range(10, 14)}
+_FILES = {"00_05": range(6), "06_09": range(6, 10), "10_13": range(10, 14)}
 
-__all__ = ["CHECKS", "Verdict", "check", "expect", "expect_close", "names", "numbers"]
+__all__ = ["CHECKS", "Verdict", "check", "compare", "expect", "expect_close", "names", "numbers"]
 
 
 @dataclass(frozen=True)
@@ -40,12 +45,6 @@ class Verdict:
 
     def __repr__(self) -> str:
         return self.line
-
-
-@overload
-def check(name: str) -> Callable[[Judge], Judge]: ...
-@overload
-def check(name: str, answer: Any, /) -> Verdict: ...
 
 
 def check(name: str, *answer: Any) -> Any:
@@ -95,6 +94,28 @@ def expect(holds: Any, otherwise: str) -> None:
         raise AssertionError(f"Not yet: {otherwise}")
 
 
+def compare(
+    name: str, what: str, **tolerances: float
+) -> Callable[[Callable[[], Iterator[Any]]], Judge]:
+    """Register an exercise whose answer is a function, by its cases.
+
+    The decorated generator yields a tuple of arguments, the right value, and, where there are
+    likely slips, a mapping of hints to the wrong values that deserve them. `{0}` in `what` is the
+    first argument.
+    """
+
+    def register(cases: Callable[[], Iterator[Any]]) -> Judge:
+        def judge(answer: Any) -> None:
+            for given, right, *slips in cases():
+                found, said = answer(*copy.deepcopy(given)), what.format(*given)
+                expect_close(found, right, said, slips[0] if slips else None, **tolerances)
+
+        judge.__module__ = cases.__module__
+        return _register(name, judge)
+
+    return register
+
+
 def numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     """The reader's answer as an array of finite numbers of this shape, called `what` in messages.
 
@@ -108,7 +129,9 @@ def numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
         raise AssertionError(
             f"Not yet: {what} should be numbers, got {type(value).__name__}"
         ) from None
-    expect(found.shape == shape, f"{what} should have shape {shape}, yours has {found.shape}")
+    wanted = f"have shape {shape}" if shape else "be one number"
+    expect(found.shape == shape, f"{what} should {wanted}, yours has {found.shape}")
+    expect(not np.iscomplexobj(found), f"{what} should be real: take real parts")
     bad = np.argwhere(~np.isfinite(found))
     expect(not len(bad), f"{what}{_place(bad)} should be finite")
     return found

@@ -5,86 +5,60 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 
 from cmc.envs.peg_push import BOX_TOP, PUSH, PegPush
-from cmc.exercises import check, expect, expect_close, numbers
+from cmc.exercises import check, compare, expect, expect_close, numbers
 from cmc.plants import Plant
 from cmc.policies import ModularPolicy, PositiveNetwork
-from cmc.robot.panda import JOINTS, READY, load_scene
+from cmc.robot.panda import JOINTS
 from cmc.theory.certify import certify
 from cmc.theory.combinations import transforms_that_fit
 from cmc.theory.exact import Region
 
-# ---- lesson 10: the task-space torque, a posture the tip does not feel, a soft press
-
 
 def _states() -> Iterator[tuple[np.ndarray, ...]]:
-    """M (7, 7), J (6, 7), h (7,) and J' q' (6,) of the Panda in random states."""
-    model = load_scene("panda.xml")
-    data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    site = model.site("tip_nominal").id
+    """M (7, 7), J (6, 7) and three vectors (7,), (6,), (6,): any will do."""
+    rng = np.random.default_rng(0)
     for _ in range(5):
-        data.qpos[:JOINTS] = READY + 0.3 * rng.normal(size=JOINTS)
-        data.qvel[:JOINTS] = rng.normal(size=JOINTS)
-        mujoco.mj_forward(model, data)
-        M, (J, rate) = np.zeros((model.nv, model.nv)), np.zeros((2, 6, model.nv))
-        mujoco.mj_fullM(model, data, M)
-        mujoco.mj_jacSite(model, data, J[:3], J[3:], site)
-        body = int(model.site_bodyid[site])
-        mujoco.mj_jacDot(model, data, rate[:3], rate[3:], data.site_xpos[site], body)
-        yield M, J, data.qfrc_bias - data.qfrc_passive, rate @ data.qvel
+        A = rng.normal(size=(JOINTS, JOINTS))
+        M, J = A @ A.T + np.eye(JOINTS), rng.normal(size=(6, JOINTS))
+        yield M, J, *(rng.normal(size=n) for n in (JOINTS, 6, 6))
 
 
-@check("10-torque")
-def torque(answer: Any) -> None:
-    """Judge `my_torque(M, J, h, drift, p)` by the tip acceleration it gives, J M^-1 (tau - h)."""
-    rng = np.random.default_rng(1)
-    for M, J, h, drift in _states():
-        p = rng.normal(size=6)
-        tau = numbers(answer(M, J, h, drift, p), (JOINTS,), "the torque")
-        found = J @ np.linalg.solve(M, tau - h) + drift
+@compare("10-torque", "the torque", atol=1e-6)
+def torque() -> Iterator[Any]:
+    """`my_torque(M, J, h, drift, p)`: M J^+ (p - drift) + h, which makes the tip's x'' be p."""
+    for M, J, h, drift, p in _states():
+        inertia, joints = np.linalg.inv(J @ np.linalg.solve(M, J.T)), M @ np.linalg.pinv(J)
         slips = {
-            "J' q' counts twice: p is the whole acceleration x''": p + drift,
-            "h is missing": p - J @ np.linalg.solve(M, h),
+            "J' q' counts twice: p is the whole acceleration x''": joints @ p + h,
+            "h is missing": joints @ (p - drift),
+            "the tip is right, but the joints differ: the acceleration form was asked for, M J^+": (
+                J.T @ inertia @ (p - drift) + h
+            ),
         }
-        expect_close(found, p, "the tip acceleration under your torque", slips, atol=1e-7)
-        right = np.allclose(tau, M @ np.linalg.pinv(J) @ (p - drift) + h, atol=1e-6)
-        hint = "the tip is right, but the joints differ: the acceleration form was asked for, M J^+"
-        expect(right, hint)
+        yield (M, J, h, drift, p), joints @ (p - drift) + h, slips
 
 
 @check("10-posture")
 def posture(answer: Any) -> None:
     """Judge `my_posture(M, J, qn)`: J M^-1 tau = 0, and as much of q'' = qn as that allows."""
-    rng = np.random.default_rng(2)
-    for M, J, _, _ in _states():
-        qn = rng.normal(size=JOINTS)
+    for M, J, qn, *_ in _states():
         made = np.linalg.solve(M, numbers(answer(M, J, qn), (JOINTS,), "the torque"))
         expect_close(J @ made, np.zeros(6), "what your torque does to the tip", atol=1e-7)
         free = np.linalg.svd(J)[2][-1]  # the joint motion that the tip does not feel
         wanted = free @ qn, free @ M @ qn / (free @ M @ free)
-        expect(
-            np.isclose(free @ made, wanted).any(),
-            f"the elbow should accelerate at {wanted[0]:.3g} or {wanted[1]:.3g} (M-weighted),"
-            f" yours at {free @ made:.3g}",
-        )
+        said = f"at {wanted[0]:.3g} or {wanted[1]:.3g} (M-weighted), yours at {free @ made:.3g}"
+        expect(np.isclose(free @ made, wanted).any(), f"the elbow should accelerate {said}")
 
 
-@check("10-limit")
-def limit(answer: Any) -> None:
-    """Judge `my_limit(mass, K_p, clip)`: mass (K_p clip + limit) = 1 N, and never below 0."""
+@compare("10-limit", "the limit for {0} kg")
+def limit() -> Iterator[Any]:
+    """`my_limit(mass, K_p, clip)`: mass (K_p clip + limit) = 1 N, and never below 0."""
     for mass, clip in ((1.7, 0.005), (4.0, 0.004), (7.0, 0.005)):
-        name = f"the limit for {mass} kg and {1e3 * clip:g} mm"
-        expect_close(answer(mass, 40.0, clip), max(0.0, 1.0 / mass - 40.0 * clip), name)
-
-
-# ---- lesson 11: TD3's target, off-policy correction, the designer's gain
-
-
-Array = np.ndarray
+        yield (mass, 40.0, clip), max(0.0, 1.0 / mass - 40.0 * clip)
 
 
 @check("11-target")
@@ -95,12 +69,11 @@ def target(answer: Any) -> None:
     critics = (lambda x: x[:, 15:18].sum(-1, keepdim=True), lambda x: 0.5 - x[:, 15:16])
 
     def ask(noise: float) -> Any:
-        return answer(reward, following, lambda s: 0.7 * s[:, :3], critics, 0.5, noise)
+        found = answer(reward, following, lambda s: 0.7 * s[:, :3], critics, 0.5, noise)
+        return found.detach() if isinstance(found, torch.Tensor) else found
 
     a = torch.tanh(0.7 * following[:, :3])
     values = a.sum(-1, keepdim=True), 0.5 - a[:, :1]
-    found = ask(0.0)
-    found = found.detach() if isinstance(found, torch.Tensor) else found
     slips: dict[str, Any] = {
         "the smaller of the two values, not the larger": reward + 0.5 * torch.maximum(*values),
         "the smaller of the two values, not their mean": reward + 0.25 * (values[0] + values[1]),
@@ -109,96 +82,66 @@ def target(answer: Any) -> None:
         "the reward is missing": 0.5 * torch.minimum(*values),
     }
     wanted: Any = reward + 0.5 * torch.minimum(*values)
-    expect_close(found, wanted, "the target without noise", slips, atol=1e-5)
+    expect_close(ask(0.0), wanted, "the target without noise", slips, atol=1e-5)
     expect(not torch.allclose(ask(0.2), wanted), "the slow actor's action should get noise")
-    expect(
-        bool(((ask(100.0) - reward).abs() <= 0.5 * 3.0 + 1e-5).all()),
-        "noise and action should stay in their bounds: clip the noise to 0.5, the action to 1",
-    )
+    hint = "noise and action should stay in their bounds: clip the noise to 0.5, the action to 1"
+    expect((ask(100.0) - reward).abs().max() <= 0.5 * 3.0 + 1e-5, hint)
 
 
-@check("11-relabel")
-def relabel(answer: Any) -> None:
-    """Judge `my_choice(states, actions, goals, act)`: the position of the likeliest sub-goal.
+@compare("11-relabel", "the position of the candidate that explains the actions best")
+def relabel() -> Iterator[Any]:
+    """`my_choice(states, actions, goals, act)`: the position of the likeliest sub-goal.
 
-    Segments are made by low levels that pursue one of the candidates, with noise. A wrong choice
-    is compared with what common slips would choose.
+    Segments are made by low levels that pursue one of the candidates, with noise.
     """
     rng = np.random.default_rng(0)
-    for trial in range(40):
+    for _ in range(40):
         n, ticks, count = (int(rng.integers(*ends)) for ends in ((1, 5), (3, 9), (2, 7)))
-        W = rng.normal(size=(n, 2 * n))
+        W, goals, drift = rng.normal(size=(n, 2 * n)), rng.normal(size=(count, n)), 0.4
 
-        def act(state: Array, left: Array, W: Array = W) -> Array:
+        def act(state: np.ndarray, left: np.ndarray, W: np.ndarray = W) -> np.ndarray:
             return np.tanh(W @ np.concatenate([state, 2.0 * left]))
 
-        goals = rng.normal(size=(count, n))
-        states, actions = [rng.normal(size=n)], list[Array]()
-        left = goals[int(rng.integers(count))]
-        for _ in range(ticks):
-            actions.append(act(states[-1], left) + 0.3 * rng.normal(size=n))
-            states.append(states[-1] + 0.4 * rng.normal(size=n))
-            left = left + states[-2] - states[-1]
-        seen, did = np.array(states[:-1]), np.array(actions)
-        shrinking, whole = (_losses(seen, did, goals, act, shrink) for shrink in (True, False))
-        best, found = int(np.argmin(shrinking)), answer(seen, did, goals, act)
-        place = int(numbers(found, (), "the choice"))
-        hint = f"the answer should be a position from 0 to {count - 1}, yours is {found!r}"
-        expect(0 <= place < count, hint)
-        hint = "is yours the largest squared error?" if place == np.argmax(shrinking) else ""
-        if place == np.argmin(whole) != best:
-            hint = "what is left of a sub-goal shrinks while it is pursued: g' = s + g - s'"
-        expect(
-            place == best,
-            f"segment {trial}: candidate {best} explains the actions best (squared error "
-            f"{shrinking[best]:.2f}, yours {shrinking[place]:.2f}). {hint}",
+        states = rng.normal(size=n) + drift * rng.normal(size=(ticks, n)).cumsum(axis=0)
+        acted = np.array(
+            [[[act(s, g + k * (states[0] - s)) for s in states] for g in goals] for k in (0, 1)]
         )
+        actions = acted[1, rng.integers(count)] + 0.3 * rng.normal(size=(ticks, n))
+        whole, shrinking = ((actions - acted) ** 2).sum((2, 3))
+        hint = "what is left of a sub-goal shrinks while it is pursued: g' = s + g - s'"
+        slips = {hint: whole.argmin(), "is yours the largest squared error?": shrinking.argmax()}
+        yield (states, actions, goals, act), shrinking.argmin(), slips
 
 
-def _losses(states: Array, actions: Array, goals: Array, act: Any, shrink: bool) -> Array:
-    """Sum of squared errors for each candidate, with or without a sub-goal that shrinks."""
-    acted = [[act(s, goal + shrink * (states[0] - s)) for s in states] for goal in goals]
-    return np.asarray(((actions - np.array(acted)) ** 2).sum((1, 2)))
-
-
-@check("11-gain")
-def gain(answer: Any) -> None:
-    """Judge `my_gain(K_p, K_d, h, level)`: (K_d + g K_2) h = level with the smaller root K_2."""
+@compare("11-gain", "the gain for K_p = {0}, K_d = {1}")
+def gain() -> Iterator[Any]:
+    """`my_gain(K_p, K_d, h, level)`: (K_d + g K_2) h = level with the smaller root K_2."""
     for K_p, K_d, h, level in ((40.0, 20.0, 0.02, 1.0), (20.0, 30.0, 0.02, 2.0), (20, 10, 0.01, 1)):
         small, large = (2 * K_p / (K_d + s * np.sqrt(K_d**2 - 4 * K_p)) for s in (1, -1))
         slips = {"this is the larger root: K_d *plus* the square root": (level / h - K_d) / large}
-        wanted, name = (level / h - K_d) / small, f"the gain for K_p = {K_p}, K_d = {K_d}"
-        expect_close(answer(K_p, K_d, h, level), wanted, name, slips)
+        yield (K_p, K_d, h, level), (level / h - K_d) / small, slips
 
 
-# ---- lesson 12: the return of a segment, the discount that decides, a plan
-
-
-@check("12-segment-return")
-def segment_return(answer: Any) -> None:
-    """Judge `my_segment_return(rewards, horizon)`: the sum from every tick to its segment's end."""
+@compare("12-segment-return", "the rest of the segment's return at every tick")
+def segment_return() -> Iterator[Any]:
+    """`my_segment_return(rewards, horizon)`: the sum from every tick to its segment's end."""
     rng = np.random.default_rng(0)
-    for segments, horizon in ((1, 4), (3, 5), (50, 20)):
-        rewards = rng.normal(size=segments * horizon)
-        found = numbers(answer(rewards.copy(), horizon), rewards.shape, "the return of every tick")
-        last = slice(horizon - 1, None, horizon)
-        expect_close(found[last], rewards[last], "the last tick of every segment")
-        rows = rewards.reshape(segments, horizon)
-        wanted = rows[:, ::-1].cumsum(1)[:, ::-1].ravel()
-        expect_close(found, wanted, "the rest of the segment's return at every tick")
+    for segments, horizon in ((3, 5), (1, 4), (50, 20)):
+        rewards = rng.normal(size=(segments, horizon))
+        right = rewards[:, ::-1].cumsum(1)[:, ::-1].ravel()
+        on = {"the sum ends with the segment": rewards.ravel()[::-1].cumsum()[::-1]}
+        yield (rewards.ravel(), horizon), right, on
 
 
-@check("12-discount")
-def discount(answer: Any) -> None:
-    """Judge `my_discount(push, stand)`: the first of 0, .01, .. .99 at which push is worth more."""
+@compare("12-discount", "the smallest discount at which pushing is worth more")
+def discount() -> Iterator[Any]:
+    """`my_discount(push, stand)`: the first of 0, .01, .. .99 at which push is worth more."""
     rng = np.random.default_rng(0)
     for _ in range(5):
         push = np.r_[-rng.uniform(0.1, 0.3, 4), np.zeros(16)]
-        stand = np.full(20, -rng.uniform(0.04, 0.09))
-        steps = np.arange(100) / 100
+        stand, steps = np.full(20, -rng.uniform(0.04, 0.09)), np.arange(100) / 100
         better = [((push - stand) * gamma ** np.arange(20)).sum() > 0 for gamma in steps]
-        name = "the smallest discount at which pushing is worth more"
-        expect_close(answer(push, stand), steps[int(np.argmax(better))], name)
+        yield (push, stand), steps[int(np.argmax(better))]
 
 
 @check("12-plan")
@@ -221,15 +164,9 @@ def plan(answer: Any) -> None:
         obs, reward, *_, info = task.step(u)
         total += float(reward[0])
     away = 1e3 * float(np.linalg.norm(obs[0, layout["goal"]] - obs[0, layout["position"]]))
-    expect(
-        info["success"][0],
-        f"the tip ends {away:.2f} mm from the target, at waypoint {stage + 1} of {len(way)}: "
-        "no strict touch",
-    )
+    where = f"{away:.2f} mm from the target, at waypoint {stage + 1} of {len(way)}"
+    expect(info["success"][0], f"the tip ends {where}: no strict touch")
     expect(total > -90.0, f"a strict touch, with a return of {total:.0f}; wanted above -90")
-
-
-# ---- lesson 13: orders, the longest hold, what a limit can hold, a plant of one's own
 
 
 @check("13-order")
@@ -252,35 +189,32 @@ def order(answer: Any) -> None:
 @check("13-hold")
 def hold(answer: Any) -> None:
     """Judge `my_hold(proved, low, high)`: the largest proved h to 1 %, with few questions."""
-    for edge, low, high in ((0.37, 0.05, 3.0), (2.9, 0.05, 3.0), (0.051, 0.05, 3.0)):
+    for edge in (0.37, 2.9, 0.051):
         asked: list[float] = []
 
         def proved(h: float, edge: float = edge, asked: list[float] = asked) -> bool:
             asked.append(h)
             return h <= edge
 
-        found = float(numbers(answer(proved, low, high), (), "the hold"))
+        found = float(numbers(answer(proved, 0.05, 3.0), (), "the hold"))
         expect(found <= edge, f"{found:.4g} s is not proved, the edge is at {edge:.4g} s")
         expect(found >= 0.99 * edge, f"{found:.4g} s falls short of {edge:.4g} s by over 1 %")
         expect(len(asked) <= 30, f"{len(asked)} questions, wanted at most 30")
 
 
-@check("13-angle")
-def angle(answer: Any) -> None:
-    """Judge `my_angle(limit)`: 3 limit = 15 sin(angle), 90 degrees where it always suffices."""
-    for limit in (0.5, 2.0, 4.9):
-        wanted = np.arcsin(3 * limit / 15)
-        expect_close(answer(limit), wanted, f"the angle that {limit} Nm can hold")
-    for limit in (5.0, 8.0):
-        expect_close(answer(limit), np.pi / 2, f"with {limit} Nm every angle up to 90 degrees:")
+@compare("13-angle", "the angle that {0} Nm can hold, at most 90 degrees,")
+def angle() -> Iterator[Any]:
+    """`my_angle(limit)`: 3 limit = 15 sin(angle), 90 degrees where it always suffices."""
+    for limit in (0.5, 2.0, 4.9, 5.0, 8.0):
+        yield (limit,), np.arcsin(min(3 * limit / 15, 1.0))
 
 
 @check("13-own")
 def own(answer: Any) -> None:
     """Judge `my_plant()`: f, y, u, floor, cap; not linear, n >= 2, certified in the middle."""
     found = answer()
-    five = isinstance(found, tuple) and len(found) == 5
-    expect(five, "wanted five things: f, y, u, floor and cap")
+    hint = "wanted five things: f, y, u, floor and cap"
+    expect(isinstance(found, tuple) and len(found) == 5, hint)
     f, y, u, floor, cap = found
     plant = Plant.from_function(f, y=y, u=u)
     expect(plant.n >= 2, f"wanted at least two signals, got {plant.n}")

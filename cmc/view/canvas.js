@@ -20,10 +20,7 @@ const LETTERS = {
 
 let theme = LIGHT;
 
-function brightness(color) {
-  const [r, g, b] = color;
-  return 0.3 * r + 0.59 * g + 0.11 * b;
-}
+const brightness = ([r, g, b]) => 0.3 * r + 0.59 * g + 0.11 * b;
 
 function themeOf(node) {
   const text = getComputedStyle(node).color.match(/[\d.]+/g).map(Number);
@@ -59,9 +56,7 @@ function runs(label) {
   return out;
 }
 
-function plain(label) {
-  return runs(label).map((run) => run.text).join("");
-}
+const plain = (label) => runs(label).map((run) => run.text).join("");
 
 function setRun(ctx, run, base) {
   ctx.font = (run.italic ? "italic " : "") + (run.shift ? TINY : base);
@@ -87,23 +82,30 @@ function drawText(ctx, label, x, y, align = "left", base = FONT) {
   }
 }
 
+function drawUpwards(ctx, label, x, y) {
+  ctx.save();
+  ctx.translate(x, y);
+  ctx.rotate(-Math.PI / 2);
+  drawText(ctx, label, 0, 0, "center");
+  ctx.restore();
+}
+
 // ---- axes
 
 function ticks(low, high, count) {
   const raw = (high - low) / Math.max(count, 1);
   const power = 10 ** Math.floor(Math.log10(raw));
-  const step = [1, 2, 5, 10].find((m) => m * power >= raw) * power;
-  const out = [];
-  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) out.push(k * step);
-  return out;
+  return every([1, 2, 5, 10].find((m) => m * power >= raw) * power, low, high);
 }
 
 function logTicks(low, high) {
-  const first = Math.ceil(low - 1e-9), last = Math.floor(high + 1e-9);
-  if (last <= first) return ticks(low, high, 3);
-  const stride = Math.max(1, Math.ceil((last - first) / 5));
+  const decades = Math.floor(high + 1e-9) - Math.ceil(low - 1e-9);
+  return decades > 0 ? every(Math.ceil(decades / 5), low, high) : ticks(low, high, 3);
+}
+
+function every(step, low, high) {
   const out = [];
-  for (let k = first; k <= last; k += stride) out.push(k);
+  for (let k = Math.ceil(low / step - 1e-9); k * step <= high + 1e-9 * step; k++) out.push(k * step);
   return out;
 }
 
@@ -113,9 +115,9 @@ function tickText(value, log) {
     return Number.isInteger(value) ? `$10^{${power}}$` : (10 ** value).toPrecision(2);
   }
   if (value === 0 || Math.abs(value) < 1e-12) return "0";
-  const size = Math.abs(value);
-  if (size >= 1e5 || size < 1e-3) return value.toExponential(1).replace("e+", "e").replace("-", "−");
-  return String(+value.toPrecision(6)).replace("-", "−");
+  const size = Math.abs(value), short = +value.toPrecision(6);
+  const text = size >= 1e6 || size < 1e-3 ? short.toExponential() : String(short);
+  return text.replace("e+", "e").replaceAll("-", "−");
 }
 
 class Axes {
@@ -164,19 +166,9 @@ class Axes {
     ctx.fillStyle = theme.ink;
     for (const v of xs) drawText(ctx, tickText(v, false), this.x(v), bottom + 16, "center", SMALL);
     for (const v of ys) drawText(ctx, tickText(v, this.log), left - 6, height(v) + 4, "right", SMALL);
-    this.labels(ctx, panel);
-  }
-
-  labels(ctx, panel) {
-    const { left, top, right, bottom } = this.box;
-    ctx.fillStyle = theme.ink;
     drawText(ctx, panel.x, (left + right) / 2, bottom + 35, "center");
-    ctx.save();
-    ctx.translate(15, (top + bottom) / 2);
-    ctx.rotate(-Math.PI / 2);
-    drawText(ctx, panel.y, 0, 0, "center");
-    ctx.restore();
-    if (panel.title) drawText(ctx, panel.title, left, 19);
+    drawUpwards(ctx, panel.y, 15, (top + bottom) / 2);
+    drawText(ctx, panel.title, left, 19);
   }
 }
 
@@ -232,30 +224,29 @@ const draw = {
   },
 
   shade(ctx, ax, layer) {
-    const { left, top, right, bottom } = ax.box;
+    const { left, top, right, bottom } = ax.box, across = layer.axis === "x";
+    const at = (value, edge) => (value === null ? edge : ax[layer.axis](value));
     const [low, high] = layer.span;
+    const [a, b] = across ? [at(low, left), at(high, right)] : [at(high, top), at(low, bottom)];
     ctx.globalAlpha = layer.alpha;
-    if (layer.axis === "x") {
-      const a = low === null ? left : ax.x(low), b = high === null ? right : ax.x(high);
-      ctx.fillRect(a, top, b - a, bottom - top);
-    } else {
-      const a = low === null ? bottom : ax.y(low), b = high === null ? top : ax.y(high);
-      ctx.fillRect(left, b, right - left, a - b);
-    }
+    ctx.fillRect(...(across ? [a, top, b - a, bottom - top] : [left, a, right - left, b - a]));
   },
 
   rule(ctx, ax, layer, get) {
-    const { left, top, right, bottom } = ax.box;
-    const value = get(layer.value)[0];
+    const { left, top, right, bottom } = ax.box, at = ax[layer.axis](get(layer.value)[0]);
     ctx.lineWidth = layer.width ?? 1.3;
     ctx.setLineDash(layer.dash ? [6, 4] : []);
-    ctx.beginPath();
-    if (layer.axis === "x") { ctx.moveTo(ax.x(value), top); ctx.lineTo(ax.x(value), bottom); }
-    else { ctx.moveTo(left, ax.y(value)); ctx.lineTo(right, ax.y(value)); }
-    ctx.stroke();
+    segment(ctx, ...(layer.axis === "x" ? [at, top, at, bottom] : [left, at, right, at]));
     ctx.setLineDash([]);
   },
 };
+
+function segment(ctx, x0, y0, x1, y1) {
+  ctx.beginPath();
+  ctx.moveTo(x0, y0);
+  ctx.lineTo(x1, y1);
+  ctx.stroke();
+}
 
 function trace(ctx, ax, xs, ys, length) {
   let open = false, lastX = 0, lastY = 0;
@@ -316,14 +307,9 @@ function drawCells(ctx, panel, layer, get, cursor, width, height) {
     drawText(ctx, text, x + side / 2, y + side / 2 + 4, "center");
   }
   ctx.fillStyle = theme.ink;
-  if (panel.title) drawText(ctx, panel.title, 8, 19);
-  if (panel.x) drawText(ctx, panel.x, left + side * columns / 2, top + side * rows + 18, "center");
-  if (!panel.y) return;
-  ctx.save();
-  ctx.translate(left - 10, top + side * rows / 2);
-  ctx.rotate(-Math.PI / 2);
-  drawText(ctx, panel.y, 0, 0, "center");
-  ctx.restore();
+  drawText(ctx, panel.title, 8, 19);
+  drawText(ctx, panel.x, left + side * columns / 2, top + side * rows + 18, "center");
+  drawUpwards(ctx, panel.y, left - 10, top + side * rows / 2);
 }
 
 // The corner of the axes in which the fewest points lie under the legend.
@@ -366,7 +352,7 @@ function drawLegend(ctx, ax, layers, get) {
       ctx.globalAlpha = 0.35; ctx.fillRect(x + 5, cy - 5, 18, 10); ctx.globalAlpha = 1;
     } else {
       ctx.setLineDash(layer.dash ? [5, 3] : []);
-      ctx.beginPath(); ctx.moveTo(x + 4, cy); ctx.lineTo(x + 24, cy); ctx.stroke();
+      segment(ctx, x + 4, cy, x + 24, cy);
       ctx.setLineDash([]);
     }
     ctx.fillStyle = theme.ink;
@@ -448,20 +434,16 @@ class View {
     this.note.setAttribute("role", "status");
     this.alert.setAttribute("role", "alert");
     this.canvases = [];
-    this.cursor = null;
-    this.playing = null;
-    this.requested = null;
+    this.cursor = this.playing = this.requested = null;
     this.addControls();
-    this.onFrame = () => this.request();
-    this.onError = () => this.showError();
+    const request = () => this.request(), say = () => this.showError();
+    this.heard = [["change:frame", request], ["change:error", say], ["change:note", say]];
+    for (const [event, act] of this.heard) model.on(event, act);
     // Pages switch between light and dark by attributes of their root or body.
-    this.watch = new MutationObserver(() => this.request());
+    this.watch = new MutationObserver(request);
     for (const node of [document.documentElement, document.body]) {
       this.watch.observe(node, { attributes: true });
     }
-    model.on("change:frame", this.onFrame);
-    model.on("change:error", this.onError);
-    model.on("change:note", this.onError);
     requestAnimationFrame(() => this.draw());  // in the page by then, and of its colors
     this.showError();
     for (const wait of [0, 500, 3000]) setTimeout(nameHandles, wait);
@@ -501,7 +483,7 @@ class View {
   }
 
   stop() {
-    if (this.playing) cancelAnimationFrame(this.playing);
+    cancelAnimationFrame(this.playing);
     this.playing = null;
     this.button.textContent = "▶ play";
   }
@@ -547,13 +529,8 @@ class View {
     });
     if (this.status.textContent !== frame.text) this.status.textContent = frame.text;
     this.controls.hidden = !frame.time;
-    if (frame.time) {
-      const last = frame.time.shape[0] - 1;
-      this.slider.max = last;
-      this.cursor = Math.min(this.cursor ?? 0, last);  // a motion opens at its beginning
-    } else {
-      this.cursor = null;
-    }
+    this.slider.max = (frame.time?.shape[0] ?? 1) - 1;  // a motion opens at its beginning
+    this.cursor = frame.time && Math.min(this.cursor ?? 0, +this.slider.max);
   }
 
   showError() {
@@ -568,10 +545,8 @@ class View {
   remove() {
     this.stop();
     this.watch.disconnect();
-    if (this.requested) cancelAnimationFrame(this.requested);
-    this.model.off("change:frame", this.onFrame);
-    this.model.off("change:error", this.onError);
-    this.model.off("change:note", this.onError);
+    cancelAnimationFrame(this.requested);
+    for (const [event, act] of this.heard) this.model.off(event, act);
     this.root.remove();
   }
 }

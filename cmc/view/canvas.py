@@ -2,8 +2,8 @@
 
 A table holds a picture for every position of the controls. Where all combinations of the controls'
 values are few, each has its picture; else each control is moved alone, the others at their start.
-Arrays become 16-bit shares of their range over all pictures (small ones stay as they are), pictures
-become differences to the one before, high and low bytes lie apart, and the whole is deflated.
+Large arrays are rounded to what the eye can tell, pictures become differences to the one before (of
+their float32 as whole numbers), first to fourth bytes lie apart, and the whole is deflated.
 `frames.js` reads it.
 """
 
@@ -13,7 +13,7 @@ import itertools
 import json
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ import traitlets
 from numpy.typing import NDArray
 
 from cmc.view.picture import Data, Panel, Source, encode, lines, panel
-from cmc.view.style import CYCLE
 
 _FOLDER = Path(__file__).parent
 STYLE = _FOLDER / "canvas.css"
@@ -31,17 +30,15 @@ SCRIPT = "".join((_FOLDER / name).read_text("utf-8") for name in ("frames.js", "
 """The widget's module: `frames.js` and `canvas.js` in one."""
 
 _LARGEST_GRID = 450  # most combinations that are all drawn; beyond, one control moves at a time
-_EXACT = 64  # arrays of at most so many numbers travel as float32
-_CODES = 65532  # shares of the range; the three codes above are -inf, inf and nan
+_EXACT = 64  # arrays of at most so many numbers are not rounded
 
 
 class Canvas(anywidget.AnyWidget):
     """Panels drawn by the browser from arrays that the kernel sends.
 
-    A frame is sent whole; the browser draws the newest one at its next repaint, so that frames
-    which arrive faster than they can be drawn are skipped. Without a kernel the pictures of `table`
-    follow the widgets named in `controls`; without those, `note` says that the
-    picture is stale. `error`, if any, is shown beside the picture, which is then grayed.
+    The browser draws the newest frame at its next repaint and skips those before. Without a kernel
+    the pictures of `table` follow the widgets named in `controls`; without a table, `note` says
+    that they are stale. `error`, if any, is shown beside the picture, which is then grayed.
     """
 
     _esm = SCRIPT
@@ -82,10 +79,7 @@ class LiveCurve(Canvas):
     ) -> None:
         self.names, self._sent = tuple(names), -np.inf
         self._points: dict[str, list[float]] = {name: [] for name in ("x", *self.names)}
-        made = [
-            lines("x", name, color=CYCLE[k % len(CYCLE)], label=name if len(self.names) > 1 else "")
-            for k, name in enumerate(self.names)
-        ]
+        made = [lines("x", name, label=name if len(self.names) > 1 else "") for name in self.names]
         describe = "A learning curve that grows while the training runs."
         super().__init__([panel(*made, x=x, y=y, size=(560, 300))], describe)
         self.finish()
@@ -119,64 +113,35 @@ def frame_table(
     start = [v[k] for v, k in zip(values, starts, strict=True)]
     alone = ([*start[:k], v, *start[k + 1 :]] for k, each in enumerate(values) for v in each)
     frames = [picture(*each) for each in (itertools.product(*values) if full else alone)]
-    blocks = [list(_blocks(frame)) for frame in frames]
-    ranges = [_range([f[k] for f in blocks if k < len(f)]) for k in range(max(map(len, blocks)))]
-    words = [_words(found, ranges) for found in blocks]
-    before = [np.zeros(0, np.uint16), *words[:-1]]
+    words = [_rounded(frame).view(np.uint32) for frame in frames]
+    before = [np.zeros(0, np.uint32), *words[:-1]]
     changes = [w - b if w.size == b.size else w for w, b in zip(words, before, strict=True)]
-    flat = np.concatenate(changes)
-    halves = (flat >> 8).astype(np.uint8).tobytes() + (flat & 255).astype(np.uint8).tobytes()
+    planes = np.concatenate(changes).astype("<u4").view(np.uint8).reshape(-1, 4).T
     layouts = [{k: v for k, v in frame.items() if k != "data"} for frame in frames]
     return {
         "full": full,
         "counts": [len(v) for v in values],
         "starts": list(starts),
-        "ranges": ranges,
         "sizes": [int(w.size) for w in words],
         "layouts": zlib.compress(json.dumps(layouts, allow_nan=False).encode(), 9),
-        "words": zlib.compress(halves, 9),
+        "words": zlib.compress(planes.tobytes(), 9),
     }
 
 
-def _blocks(frame: Mapping[str, Any]) -> Iterator[NDArray[np.float32]]:
-    """The arrays of a frame in the order of its bytes; large ones on a log axis as logarithms."""
-    if "error" in frame:
-        return
-    found = [
-        (ref, bool(panel["log"]) and name in ("y", "y2"))
-        for panel in frame["panels"]
-        for layer in panel["layers"]
-        for name, ref in layer.items()
-        if isinstance(ref, dict) and "at" in ref
-    ]
-    if frame["time"]:
-        found.append((frame["time"], False))
-    numbers = np.frombuffer(frame["data"], np.float32)
-    for ref, log in sorted(found, key=lambda item: item[0]["at"]):
-        array = numbers[ref["at"] : ref["at"] + int(np.prod(ref["shape"]))]
-        if log and array.size > _EXACT:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                array = np.where(array > 0, np.log10(array), np.nan).astype(np.float32)
-        yield array
+def _rounded(frame: Mapping[str, Any]) -> NDArray[np.float32]:
+    """The numbers of a frame; in large arrays to 1/32768 of their axis, or 1/1024 where it is log.
 
-
-def _range(parts: Sequence[NDArray[np.float32]]) -> list[float]:
-    """Lowest and highest finite number of one block over all frames."""
-    flat = np.concatenate([part[np.isfinite(part)] for part in parts])
-    return [float(flat.min()), float(flat.max())] if flat.size else [0.0, 1.0]
-
-
-def _words(blocks: Sequence[NDArray[np.float32]], ranges: Sequence[Any]) -> NDArray[np.uint16]:
-    """One frame as 16-bit words."""
-    out = [np.zeros(0, np.uint16)]
-    for array, (low, high) in zip(blocks, ranges, strict=False):
-        if array.size <= _EXACT:
-            out.append(array.view(np.uint16))
-            continue
-        with np.errstate(invalid="ignore"):
-            share = (array.astype(float) - low) / ((high - low) or 1.0) * _CODES
-            code = np.round(np.nan_to_num(share, nan=0, posinf=0, neginf=0)).astype(np.uint16)
-        code[np.isneginf(array)], code[np.isposinf(array)] = _CODES + 1, _CODES + 2
-        code[np.isnan(array)] = _CODES + 3
-        out.append(code)
-    return np.concatenate(out)
+    Steps are powers of two, so that the last bits are zeros, which deflate well.
+    """
+    numbers = np.frombuffer(frame.get("data", b""), np.float32).copy()
+    for axes, layer in ((a, layer) for a in frame.get("panels", ()) for layer in a["layers"]):
+        for name in layer.keys() & {"x", "y", "y2"}:
+            at, size = layer[name]["at"], int(np.prod(layer[name]["shape"]))
+            part, (low, high) = numbers[at : at + size], axes["xlim" if name == "x" else "ylim"]
+            if size > _EXACT and axes["log"] and name != "x":
+                mantissa, exponent = np.frexp(part)
+                part[:] = np.ldexp(np.round(mantissa * 1024) / 1024, exponent)
+            elif size > _EXACT:
+                step = np.float32(2.0 ** np.floor(np.log2(high - low)) / 32768)
+                part[:] = np.round(part / step) * step
+    return numbers

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from cmc.view.style import BAD, GOOD, NEUTRAL, label, looks, panels
+from cmc.view.style import BAD, GOOD, NEUTRAL, looks, panels
 from cmc.view.style import COLORS as COLORS
 from cmc.view.style import CYCLE as CYCLE
 from cmc.view.style import METHOD_COLORS as METHOD_COLORS
@@ -123,8 +123,8 @@ def matrices(
         raise ValueError("wanted at least one matrix, got none")
     widths = [np.shape(M)[1] + 0.8 for M in named.values()]
     height = 0.6 * max(np.shape(M)[0] for M in named.values()) + 0.9
-    size = {"width": min(0.72 * sum(widths), 12.0), "height": height}
-    fig, axes = panels(1, len(named), width_ratios=widths, **size)
+    width = min(0.72 * sum(widths), 12.0)
+    fig, axes = panels(1, len(named), width=width, height=height, width_ratios=widths)
     for ax, (name, M) in zip(axes[0], named.items(), strict=True):
         matrix(M, block=block, labels=labels, title=name, ax=ax)
     return fig
@@ -179,9 +179,16 @@ def region(
     return fig
 
 
+def label(ax: Axes, x: str, y: str, title: str | None = None) -> None:
+    """Label both axes (units in the label: `"time (s)"`) and set an optional title."""
+    ax.set(xlabel=x, ylabel=y)
+    if title:
+        ax.set_title(title)
+
+
 def _axes(ax: Axes | None, size: tuple[float, float] = (7.0, 3.6)) -> Axes:
     """`ax`, or the axes of a new figure of a size in inches."""
-    return panels(width=size[0], height=size[1])[1][0, 0] if ax is None else ax
+    return ax or panels(width=size[0], height=size[1])[1][0, 0]
 
 
 def _finish(

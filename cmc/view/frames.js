@@ -1,7 +1,6 @@
 // Sliders without a kernel: pictures from the table of cmc.view.canvas, or a word that there are none.
 // canvas.js follows in the same module.
 
-const EXACT = 64, CODES = 65532;
 const NO_KERNEL = "Without a kernel the picture no longer follows the controls: run the cell again.";
 const ONE_AT_A_TIME = "Without a kernel one control moves at a time: the others are at their start.";
 
@@ -13,20 +12,21 @@ async function inflate(data) {
 
 class Table {
   static async open(packed) {
-    const [layouts, halves] = await Promise.all([packed.layouts, packed.words].map(inflate));
-    return new Table(packed, JSON.parse(new TextDecoder().decode(layouts)), halves);
+    const [layouts, planes] = await Promise.all([packed.layouts, packed.words].map(inflate));
+    return new Table(packed, JSON.parse(new TextDecoder().decode(layouts)), planes);
   }
 
-  constructor(packed, layouts, halves) {
+  constructor(packed, layouts, planes) {
     Object.assign(this, packed, { layouts });
-    const total = halves.length / 2, words = new Uint16Array(total);
+    const total = planes.length / 4, words = new Uint32Array(total);
     let at = 0;
     this.frames = this.sizes.map((size, k) => {  // each frame is a difference to the one before
       const before = this.sizes[k - 1] === size ? at - size : -1, first = at;
       for (let i = 0; i < size; i++, at++) {
-        words[at] = 256 * halves[at] + halves[total + at] + (before < 0 ? 0 : words[before + i]);
+        words[at] = planes[at] + (planes[total + at] << 8) + (planes[2 * total + at] << 16)
+          + (planes[3 * total + at] << 24) + (before < 0 ? 0 : words[before + i]);
       }
-      return words.subarray(first, at);
+      return new Float32Array(words.buffer, 4 * first, size);
     });
   }
 
@@ -37,36 +37,7 @@ class Table {
   }
 
   frame(position) {
-    const layout = this.layouts[position];
-    if (layout.error) return layout;
-    const found = layout.time ? [[layout.time, false]] : [];
-    for (const panel of layout.panels) {
-      for (const layer of panel.layers) {
-        for (const [name, ref] of Object.entries(layer)) {
-          if (ref?.shape) found.push([ref, panel.log && (name === "y" || name === "y2")]);
-        }
-      }
-    }
-    found.sort((a, b) => a[0].at - b[0].at);
-    const size = ([ref]) => ref.shape.reduce((a, b) => a * b, 1);
-    const data = new Float32Array(found.reduce((sum, item) => sum + size(item), 0));
-    const words = this.frames[position];
-    let from = 0;
-    found.forEach((item, k) => {
-      const count = size(item), [low, high] = this.ranges[k], start = item[0].at;
-      if (count <= EXACT) {
-        data.set(new Float32Array(words.slice(from, from + 2 * count).buffer), start);
-        from += 2 * count;
-        return;
-      }
-      for (let i = 0; i < count; i++, from++) {
-        const code = words[from];
-        const value = code <= CODES ? low + (high - low) * code / CODES
-          : [-Infinity, Infinity, NaN][code - CODES - 1];
-        data[start + i] = item[1] ? 10 ** value : value;
-      }
-    });
-    return { ...layout, serial: position + 1, data };
+    return { ...this.layouts[position], serial: position + 1, data: this.frames[position] };
   }
 }
 

@@ -193,9 +193,9 @@ def encode(panels: Sequence[Panel], data: Data, time: Source | None = None) -> d
             blocks.append(np.ascontiguousarray(array, dtype=np.float32))
         return {"at": sum(b.size for b in blocks[:-1]), "shape": list(array.shape)}
 
-    frame: dict[str, Any] = {"panels": [_lay_out(panel, data, put) for panel in panels]}
-    frame["text"] = str(data.get("text", ""))
-    frame["time"] = None if time is None else put(_array(data, time))
+    laid_out = [_lay_out(panel, data, put) for panel in panels]
+    moments = None if time is None else put(_array(data, time))
+    frame = {"panels": laid_out, "text": str(data.get("text", "")), "time": moments}
     return {**frame, "data": b"".join(block.tobytes() for block in blocks)}
 
 
@@ -204,10 +204,9 @@ def _lay_out(panel: Panel, data: Data, put: Callable[[np.ndarray], Any]) -> dict
     made = [layer.fetch(data) for layer in panel.layers]
     look = {**panel.look, "title": _fill(panel.look["title"], data)}
     for limit, names in (("xlim", ("x",)), ("ylim", ("y", "y2"))):
-        if look[limit] is None:
-            extents = [arrays[name] for arrays in made for name in names if name in arrays]
-            look[limit] = _limits(extents, log=look["log"] and limit == "ylim")
-        look[limit] = list(look[limit])
+        extents = [arrays[name] for arrays in made for name in names if name in arrays]
+        log = look["log"] and limit == "ylim"
+        look[limit] = list(look[limit] or _limits(extents, log=log))
     look["layers"] = [
         {"kind": layer.kind, **layer.look, **{name: put(array) for name, array in arrays.items()}}
         for layer, arrays in zip(panel.layers, made, strict=True)
@@ -217,7 +216,7 @@ def _lay_out(panel: Panel, data: Data, put: Callable[[np.ndarray], Any]) -> dict
 
 def _limits(extents: Sequence[np.ndarray], *, log: bool) -> tuple[float, float]:
     """Limits that hold all finite values (positive ones on a logarithmic axis), with a margin."""
-    values = np.concatenate([np.ravel(e) for e in extents]) if extents else np.zeros(0)
+    values = np.concatenate([np.zeros(0), *map(np.ravel, extents)])
     values = values[np.isfinite(values) & ((values > 0) | (not log))]
     if values.size == 0:
         return (0.1, 1.0) if log else (0.0, 1.0)
@@ -285,7 +284,6 @@ def _name(source: Source) -> str:
 
 
 def _look(color: str | None, look: dict[str, Any], *known: str) -> dict[str, Any]:
-    unknown = set(look) - set(known)
-    if unknown:
+    if unknown := set(look) - set(known):
         raise TypeError(f"unknown look {sorted(unknown)}; there are: {sorted(known)}")
     return {**look, "color": COLORS.get(color, color) if color else None}

@@ -24,6 +24,7 @@ import os
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from time import monotonic
 from typing import Any
 
 import ipywidgets as widgets
@@ -41,7 +42,7 @@ from cmc.view.picture import points as points
 from cmc.view.picture import rule as rule
 from cmc.view.picture import shade as shade
 
-_DEBOUNCE = 0.004  # s: changes that wait in the kernel's queue are answered by one frame
+_DEBOUNCE = 0.004  # s: changes that came while a picture was made are answered by one more
 
 
 @dataclass(frozen=True)
@@ -107,16 +108,15 @@ def slider(
         raise ValueError(f"wanted finite low <= start <= high, got {low}, {start}, {high}")
     if not 0 < step <= high - low:
         raise ValueError(f"wanted 0 < step <= {high - low}, got {step}")
-    if not whole or not isinstance(step, int):
-        whole, low, high, start, step = False, float(low), float(high), float(start), float(step)
-    count = int(np.ceil((high - low) / step - 1e-9)) + 1
-    steps = {min(low + k * step, high) for k in range(count)}
-    near = {v for v in steps if abs(v - start) < 1e-9 * (high - low)}
+    whole = whole and isinstance(step, int)
+    low, high, start, step = map(int if whole else float, (low, high, start, step))
+    steps = [low + k * step for k in range(int(np.ceil((high - low) / step - 1e-9)))]
+    values = [v for v in (*steps, high) if abs(v - start) >= 1e-9 * (high - low)]
     digits = max(0, int(np.ceil(-np.log10(step) - 1e-9)))
     more: dict[str, Any] = {"min": low, "max": high, "step": step}
     more["readout_format"] = "d" if whole else f".{digits}f"
     kind = widgets.IntSlider if whole else widgets.FloatSlider
-    return Control(kind, start, sorted(steps - near | {start}), label, unit, more)
+    return Control(kind, start, sorted([*values, start]), label, unit, more)
 
 
 def choice(*options: Any, start: Any = None, label: str = "") -> Control:
@@ -150,6 +150,7 @@ class Explorer(widgets.VBox):
         self.callback, self.canvas = callback, canvas
         self.errors: list[str] = []
         self._wanted: asyncio.TimerHandle | None = None
+        self._answered = 0.0  # when the last picture was done
         self.controls = {name: c.widget(name, slow=slow) for name, c in controls.items()}
         for values in _probes(controls, corners=not slow):
             self.evaluate(**values)  # raises: a broken callback fails the cell
@@ -183,24 +184,27 @@ class Explorer(widgets.VBox):
             widget.value = self._first[name]
 
     def _changed(self, _: Any) -> None:
+        if self._wanted is not None:
+            return
         try:
             loop = asyncio.get_running_loop()
         except RuntimeError:
-            self._refresh()
-            return
-        if self._wanted is None:
+            loop = None
+        if loop is None or monotonic() - self._answered > _DEBOUNCE:
+            self._refresh()  # at once: nothing has waited
+        else:
             self._wanted = loop.call_later(_DEBOUNCE, self._refresh)
 
     def _refresh(self) -> None:
         self._wanted = None
-        values = self.values
         try:
             self.evaluate()
         except Exception as error:
             # A handler's exception would reach nobody: it is shown and kept instead.
-            at = ", ".join(f"{name} = {value}" for name, value in values.items())
+            at = ", ".join(f"{name} = {value}" for name, value in self.values.items())
             self.errors.append(f"{_said(error)} (at {at})")
             self.canvas.error = self.errors[-1]
+        self._answered = monotonic()
 
 
 def explore(
@@ -235,15 +239,14 @@ def explore(
     canvas = Canvas(panels, describe, time)
     made = Explorer(callback, canvas, controls, slow)
     if os.environ.get("CMC_EXPORT", "0") not in ("", "0") if frames is None else frames:
-        starts = [c.values.index(c.start) for c in controls.values()]
 
         def picture(*values: Any) -> dict[str, Any]:
             try:
-                data = callback(**dict(zip(controls, values, strict=True)))
-                return encode(panels, data, time)
+                return encode(panels, callback(**dict(zip(controls, values, strict=True))), time)
             except Exception as error:
                 return {"error": _said(error)}
 
+        starts = [c.values.index(c.start) for c in controls.values()]
         canvas.table = frame_table([c.values for c in controls.values()], starts, picture)
     return made
 
@@ -254,12 +257,10 @@ def _probes(controls: Mapping[str, Control], *, corners: bool) -> Iterator[dict[
     The start comes last, so that its picture is the one that stays.
     """
     start = {name: control.start for name, control in controls.items()}
-    for name, control in controls.items():
-        yield from ({**start, name: value} for value in control.probes)
-    several = 1 < len(controls) <= 3
-    if corners and several and np.prod([len(c.probes) for c in controls.values()]) <= 16:
-        for ends in itertools.product(*(c.probes for c in controls.values())):
-            yield dict(zip(controls, ends, strict=True))
+    yield from ({**start, name: value} for name, c in controls.items() for value in c.probes)
+    ends = [c.probes for c in controls.values()]
+    if corners and 1 < len(ends) <= 3 and np.prod([len(values) for values in ends]) <= 16:
+        yield from (dict(zip(controls, corner, strict=True)) for corner in itertools.product(*ends))
     yield start
 
 

@@ -20,7 +20,6 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib import rc_params_from_file
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cmc.store import asset, write_atomic
@@ -50,8 +49,7 @@ def _method_of(label: str) -> str | None:
     """The method that a label names: its name, its title, or what begins with its title."""
     if label in METHODS:
         return label
-    begun = [name for name, title in METHOD_TITLES.items() if label.startswith(title)]
-    if begun:
+    if begun := [name for name, title in METHOD_TITLES.items() if label.startswith(title)]:
         return max(begun, key=lambda name: len(METHOD_TITLES[name]))
     short = {title.split("/")[-1].split(",")[0]: n for n, title in reversed(METHOD_TITLES.items())}
     return short.get(label)
@@ -90,13 +88,6 @@ def panels(
     return plt.subplots(rows, columns, figsize=size, squeeze=False, **kwargs)
 
 
-def label(ax: Axes, x: str, y: str, title: str | None = None) -> None:
-    """Label both axes (units in the label: `"time (s)"`) and set an optional title."""
-    ax.set(xlabel=x, ylabel=y)
-    if title:
-        ax.set_title(title)
-
-
 def png(fig: Figure, text: str = "") -> bytes:
     """The figure as a PNG whose `Description` field holds `text`; the figure is closed."""
     stream = io.BytesIO()
@@ -123,14 +114,13 @@ def describe(fig: Figure, text: str) -> None:
 
 def schematic(name: str, text: str) -> None:
     """Show a schematic of `assets/schematics` with a line of text under it."""
-    folder = asset("schematics")
-    if not (folder / f"{name}.svg").is_file():
-        there = sorted(file.stem for file in folder.glob("*.svg"))
-        raise ValueError(f"no schematic {name!r}; there are {there}")
-    data = (folder / f"{name}.svg").read_bytes()
-    points = re.search(rb'width="([\d.]+)pt"', data)
-    assert points is not None
-    _display(data, text, float(points[1]) / 72, "image/svg+xml")
+    files = {file.stem: file for file in asset("schematics").glob("*.svg")}
+    if name not in files:
+        raise ValueError(f"no schematic {name!r}; there are {sorted(files)}")
+    data = files[name].read_bytes()
+    width = re.search(rb'width="([\d.]+)pt"', data)
+    assert width is not None
+    _display(data, text, float(width[1]) / 72, "image/svg+xml")
 
 
 def _display(data: bytes, text: str, inches: float, kind: str) -> None:

@@ -12,16 +12,13 @@ class Model {
       const owner = path.slice(0, -1).reduce((value, key) => value[key], this.values);
       owner[path.at(-1)] = new DataView(bytes.buffer);
     }
-    this.first = this.values.value ?? null;
-    this.firstIndex = this.values.index ?? null;
+    this.first = this.values.index === undefined ? ["value", this.values.value] : ["index", this.values.index];
   }
   get(name) { return this.values[name]; }
   set(name, value) {
     if (this.values[name] === value) return;
     this.values[name] = value;
-    for (const [event, call] of Object.entries(this.handlers).flatMap(([e, calls]) => calls.map((c) => [e, c]))) {
-      if (event === "change:" + name) call();
-    }
+    for (const call of this.handlers["change:" + name] ?? []) call();
   }
   on(names, call) { for (const name of names.split(" ")) (this.handlers[name] ??= []).push(call); }
   off(name, call) { this.handlers[name] = (this.handlers[name] ?? []).filter((c) => c !== call); }
@@ -97,9 +94,7 @@ const draw = {
     const button = make("button", el, { textContent: model.get("description"), title: model.get("tooltip") ?? "" });
     button.addEventListener("click", () => {  // the course's only button puts its neighbours back
       for (const other of manager.models.values()) {
-        if (!other.beside?.has(model.id)) continue;
-        if (other.firstIndex !== null) other.set("index", other.firstIndex);
-        else if (other.first !== null) other.set("value", other.first);
+        if (other.beside?.has(model.id) && other.first[1] != null) other.set(...other.first);
       }
     });
   },

@@ -68,11 +68,12 @@ def presets(
     goes = np.isin(motion.owner, [*moving, -1])  # what is soft moves, too
     everything = _ball(low, high)
     subject = _ball(low[0, goes], high[0, goes]) if goes.any() else everything
-    soft = [cloth["corners"].mean(axis=1) for cloth in motion.cloths]
-    if moving:  # the median, as one body that falls for ever shall not take the camera along
-        track = np.median(motion.poses[:, moving, :3].astype(float), axis=1)
-    else:
-        track = sum(soft, np.zeros((len(motion.poses), 3))) / max(len(soft), 1)
+    places = motion.poses[:, moving, :3].astype(float)
+    if not moving:
+        soft = [cloth["corners"].mean(axis=1) for cloth in motion.cloths]
+        places = np.stack(soft or [np.zeros((len(places), 3))], axis=1)
+    # the median, as one body that falls for ever shall not take the camera along
+    track = np.median(places, axis=1)
     focus = subject[0] + track - track[0]
     found = _framed(everything, subject, track, trails)
     for k in range(motion.model.ncam):

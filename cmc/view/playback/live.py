@@ -73,8 +73,7 @@ class _Socket(_Door, tornado.websocket.WebSocketHandler):
         """Close the connection at once, whether the browser answers or not."""
         self._writer.cancel()
         self.view.sockets.discard(self)
-        stream = getattr(self.ws_connection, "stream", None)
-        if stream is not None:
+        if (stream := getattr(self.ws_connection, "stream", None)) is not None:
             stream.close()
 
 
@@ -154,8 +153,9 @@ class LiveView:
             runner.run(self._serve())
 
     async def _serve(self) -> None:
-        shared = {"view": self}
-        routes: list[Any] = [("/", _Page, shared), ("/socket", _Socket, shared)]
+        routes: list[Any] = [
+            (path, door, {"view": self}) for path, door in (("/", _Page), ("/socket", _Socket))
+        ]
         application = tornado.web.Application(routes, log_function=lambda handler: None)
         server = tornado.httpserver.HTTPServer(application)
         server.add_sockets(self._listeners)

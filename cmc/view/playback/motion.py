@@ -43,8 +43,8 @@ class Motion:
         parts = [part for seen in visible(model, groups).values() for part in seen]
         flat = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         solid = [i for what, i in parts if what == "geom" and not flat[i]]
-        sampled = np.unique(np.linspace(0, frames - 1, _SAMPLED).round().astype(int)).tolist()
-        boxes: dict[int, tuple[Array, Array]] = {}
+        sampled = set(np.linspace(0, frames - 1, _SAMPLED).round().astype(int).tolist())
+        boxes: list[Array] = []
         corners: list[list[Array]] = [[] for _ in soft]
         for k in range(frames - 1, -1, -1):
             if spec is None:
@@ -64,8 +64,8 @@ class Motion:
             for (_, place), found in zip(soft, corners, strict=True):
                 found.append(place(data))
             if k in sampled:
-                boxes[k] = _boxes(model, data, solid, [found[-1] for found in corners])
-        self.low, self.high = (np.array([boxes[k][side] for k in sampled]) for side in (0, 1))
+                boxes.append(_boxes(model, data, solid, [found[-1] for found in corners]))
+        self.low, self.high = np.swapaxes(boxes[::-1], 0, 1)
         self.owner = np.array([*model.geom_bodyid[solid], *[-1 for _ in soft]], dtype=int)
         self.cloths = [
             {**look, "corners": np.array(found[::-1], dtype=np.float32)}
@@ -84,14 +84,14 @@ class Motion:
 
 def _boxes(
     model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[int], soft: Sequence[Array]
-) -> tuple[Array, Array]:
-    """Lower and upper corners (things, 3) of boxes along the world's axes, m."""
+) -> Array:
+    """Lower and upper corners (2, things, 3) of boxes along the world's axes, m."""
     turn, box = data.geom_xmat[geoms].reshape(-1, 3, 3), model.geom_aabb[geoms]
     middle = data.geom_xpos[geoms] + np.einsum("gij,gj->gi", turn, box[:, :3])
     half = np.einsum("gij,gj->gi", np.abs(turn), box[:, 3:])
-    low = [*(middle - half), *[corners.min(axis=0) for corners in soft]]
-    high = [*(middle + half), *[corners.max(axis=0) for corners in soft]]
-    return np.reshape(low, (-1, 3)), np.reshape(high, (-1, 3))
+    ends = [[corners.min(axis=0), corners.max(axis=0)] for corners in soft]
+    solid = np.stack([middle - half, middle + half], axis=1)
+    return np.vstack([solid, np.reshape(ends, (-1, 2, 3))]).swapaxes(0, 1)
 
 
 def skins(model: mujoco.MjModel, groups: Sequence[int]) -> list[dict[str, Any]]:
@@ -102,19 +102,20 @@ def skins(model: mujoco.MjModel, groups: Sequence[int]) -> list[dict[str, Any]]:
     """
     found = []
     for i in np.flatnonzero(np.isin(model.skin_group, groups)):
-        first, face = model.skin_vertadr[i], model.skin_faceadr[i]
+        first, face, bone = (
+            int(getattr(model, f"skin_{n}adr")[i]) for n in ("vert", "face", "bone")
+        )
         bones = []
-        for b in range(model.skin_boneadr[i], model.skin_boneadr[i] + model.skin_bonenum[i]):
+        for b in range(bone, bone + int(model.skin_bonenum[i])):
             start = model.skin_bonevertadr[b]
             rows = slice(start, start + model.skin_bonevertnum[b])
-            bone: dict[str, Any] = {"body": int(model.skin_bonebodyid[b])}
-            bone["rest"] = [*model.skin_bonebindpos[b], *model.skin_bonebindquat[b]]
-            bone["index"] = model.skin_bonevertid[rows].astype(np.uint32)
-            bone["weight"] = model.skin_bonevertweight[rows].astype(np.float32)
-            bones.append({**bone, "rest": list(map(float, bone["rest"]))})
-        faces = model.skin_face[face : face + model.skin_facenum[i]]
+            pose = np.r_[model.skin_bonebindpos[b], model.skin_bonebindquat[b]].astype(float)
+            index = model.skin_bonevertid[rows].astype(np.uint32)
+            weight = model.skin_bonevertweight[rows].astype(np.float32)
+            placed = {"body": int(model.skin_bonebodyid[b]), "rest": pose.tolist()}
+            bones.append({**placed, "index": index, "weight": weight})
+        look = _surface(model, "skin", int(i), model.skin_face[face : face + model.skin_facenum[i]])
         rest = model.skin_vert[first : first + model.skin_vertnum[i]].astype(np.float32)
-        look = _surface(model, "skin", int(i), faces)
         found.append({**look, "corners": rest, "bones": bones})
     return [skin for skin in found if skin["opacity"] > 0]
 

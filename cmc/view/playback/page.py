@@ -12,12 +12,14 @@ import base64
 import hashlib
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
 from typing import Any
 
 import numpy as np
+
+_ROOM = resources.files("cmc.view.playback")
 
 
 def page(scenes: Sequence[Any], *, live: bool = False) -> str:
@@ -34,10 +36,15 @@ def page(scenes: Sequence[Any], *, live: bool = False) -> str:
         "LIVE": "; connect-src ws://127.0.0.1:* ws://localhost:*" if live else "",
         "TITLE": html.escape(" | ".join(scene.title for scene in scenes)),
         "VIEWER": viewer_source(),
-        "CONTENT": _json(content).replace("<", "\\u003c"),  # a name such as </script> stays text
-        "PLAYER": _own("player.js"),
+        "CONTENT": to_json(content),
+        "PLAYER": _ROOM.joinpath("player.js").read_text("utf-8"),
     }
-    head, *rest = _own("page.html").split("@@")
+    return filled(_ROOM.joinpath("page.html").read_text("utf-8"), parts)
+
+
+def filled(template: str, parts: Mapping[str, str]) -> str:
+    """A page whose `@@NAME@@` are replaced."""
+    head, *rest = template.split("@@")
     return head + "".join(parts.get(part, part) for part in rest)
 
 
@@ -59,7 +66,7 @@ def _scene(scene: Any) -> dict[str, Any]:
 
 def page_id(scenes: Sequence[Any]) -> str:
     """Short name of a page made of its contents; messages to it carry it."""
-    return hashlib.sha256(_json([_scene(s) for s in scenes]).encode()).hexdigest()[:16]
+    return hashlib.sha256(to_json([_scene(s) for s in scenes]).encode()).hexdigest()[:16]
 
 
 @cache
@@ -93,16 +100,14 @@ def _float32(item: dict[str, Any]) -> dict[str, Any]:
     return {k: v.astype("f4") if isinstance(v, np.ndarray) else v for k, v in item.items()}
 
 
-def _json(content: Any) -> str:
-    """JSON in which bytes and arrays (little-endian) are base64 text."""
-
-    def text(value: Any) -> str:
-        if isinstance(value, np.ndarray):
-            value = np.ascontiguousarray(value, value.dtype.newbyteorder("<")).tobytes()
-        return base64.b64encode(value).decode("ascii")
-
-    return json.dumps(content, separators=(",", ":"), default=text)
+def to_json(content: Any) -> str:
+    """JSON in which bytes and arrays (little-endian) are base64 text; a `</script>` stays text."""
+    text = json.dumps(content, separators=(",", ":"), default=base64_text)
+    return text.replace("<", "\\u003c")
 
 
-def _own(name: str) -> str:
-    return resources.files("cmc.view.playback").joinpath(name).read_text("utf-8")
+def base64_text(value: bytes | np.ndarray) -> str:
+    """The bytes as base64."""
+    if isinstance(value, np.ndarray):
+        value = np.ascontiguousarray(value, value.dtype.newbyteorder("<")).tobytes()
+    return base64.b64encode(value).decode("ascii")

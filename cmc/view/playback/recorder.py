@@ -7,10 +7,11 @@ lights, skyboxes. What cannot be drawn at all is left out and named in a warning
 
 from __future__ import annotations
 
+import itertools
 import os
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -74,16 +75,22 @@ class Playable:
         """The page for a notebook to display: saved to `path`, or embedded without one.
 
         A saved page keeps the notebook small, but needs a server that delivers it (JupyterLab).
-        In VS Code, Colab and voila, or with CMC_EMBED=1 (for exported HTML), the page is embedded
-        all the same, which takes 1 MB. `height` of the frame in pixels. A path that is absolute or
-        leads upwards is refused: no server would deliver it.
+        In VS Code, Colab and voila, or with CMC_EMBED=1 (for exported HTML), it is embedded all
+        the same, which takes 1 MB. `height` in pixels. A path that is absolute or leads upwards is
+        refused: no server would deliver it.
         """
         return framed(self.html(), path, height)
 
 
 def framed(text: str, path: str | Path | None = None, height: int = 480) -> Any:
     """A page in a frame: from a file at `path`, which is written, or held by the notebook."""
-    if path is None or _must_embed():  # a frame with no rights but to run its scripts
+    serverless = (  # no server here would deliver a file beside the notebook
+        os.environ.get("CMC_EMBED", "0") not in ("", "0")
+        or "VSCODE_PID" in os.environ
+        or "google.colab" in sys.modules
+        or os.environ.get("SERVER_SOFTWARE", "").startswith("voila")
+    )
+    if path is None or serverless:  # a frame with no rights but to run its scripts
         style = f"width:100%;height:{height}px;border:0"
         look = f'sandbox="allow-scripts" title="3D playback" style="{style}"'
         return HTML(f'<div><iframe srcdoc="{escape(text)}" {look}></iframe></div>')
@@ -92,16 +99,6 @@ def framed(text: str, path: str | Path | None = None, height: int = 480) -> Any:
         raise ValueError(f"path must be relative and below the notebook, got {path}")
     write_atomic(path, lambda file: file.write(text.encode()))
     return IFrame(path.as_posix(), width="100%", height=height)
-
-
-def _must_embed() -> bool:
-    """Whether no server here would deliver a file beside the notebook, or CMC_EMBED is 1."""
-    return (
-        os.environ.get("CMC_EMBED", "0") not in ("", "0")
-        or "VSCODE_PID" in os.environ
-        or "google.colab" in sys.modules
-        or os.environ.get("SERVER_SOFTWARE", "").startswith("voila")
-    )
 
 
 @dataclass(frozen=True)
@@ -183,16 +180,15 @@ def record(
             and for trails or labels that name no site or body.
     """
     time, rows, spec = _checked(model, states, times)
-    motion = Motion(model, rows, spec, groups)
+    motion, worn = Motion(model, rows, spec, groups), skins(model, groups)
     tracks = {name: motion.point(name) for name in trails}
-    drawn, worn = list(visible(model, groups)), skins(model, groups)
+    drawn, bones = list(visible(model, groups)), [bone for skin in worn for bone in skin["bones"]]
     if not (drawn or motion.cloths or worn):
         there = sorted(set(map(int, model.geom_group)))
         warnings.warn(f"nothing of groups {tuple(groups)} is seen; geoms: {there}", stacklevel=2)
-    bones = {bone["body"] for skin in worn for bone in skin["bones"]}
-    goes = np.ptp(motion.poses, axis=0).max(axis=1) > 0.0
-    moving = [b for b in sorted({*drawn, *bones}) if b in bones or goes[b]]
-    for bone in (bone for skin in worn for bone in skin["bones"]):
+    goes = set(np.flatnonzero(np.ptp(motion.poses, axis=0).max(axis=1) > 0.0).tolist())
+    moving = sorted(goes.intersection(drawn).union(bone["body"] for bone in bones))
+    for bone in bones:
         bone["body"] = moving.index(bone["body"])
     words = {
         word: motion.point(at) if isinstance(at, str) else at for word, at in (labels or {}).items()
@@ -206,7 +202,7 @@ def record(
         commands=draw(model, motion.data, groups),
         cloths=motion.cloths,
         skins=worn,
-        overlays=_overlays(len(time), tracks, markers or {}, arrows or {}, words),
+        overlays=list(_overlays(len(time), tracks, markers or {}, arrows or {}, words)),
         readouts={name: _fit(name, v, time.shape) for name, v in (readouts or {}).items()},
         cameras=cameras or presets(motion, moving, tracks),
     )
@@ -218,28 +214,25 @@ def _overlays(
     markers: Mapping[str, ArrayLike | Marker],
     arrows: Mapping[str, Arrow],
     words: Mapping[str, ArrayLike],
-) -> list[dict[str, Any]]:
+) -> Iterator[dict[str, Any]]:
     """What is drawn over the scene, as the player reads it, every array (frames, 3)."""
-    found: list[dict[str, Any]] = []
     shapes = (3,), (frames, 3)
     for name, points in tracks.items():  # a tube as thin as the path is small
         size = float(np.linalg.norm(np.ptp(points, axis=0)))
         look = {"color": _TRAIL, "radius": float(np.clip(0.004 * size, 1e-4, 4e-3))}
-        found.append({"kind": "Trail", "name": name, "points": points, **look})
-    for i, (name, given) in enumerate(markers.items()):
+        yield {"kind": "Trail", "name": name, "points": points, **look}
+    for (name, given), color in zip(markers.items(), itertools.cycle(_MARKERS), strict=False):
         marker = given if isinstance(given, Marker) else Marker(given)
-        points, color = _fit(name, marker.points, *shapes), _MARKERS[i % len(_MARKERS)]
         look = {"color": color, "radius": marker.radius}
-        found.append({"kind": "Marker", "name": name, "points": points, **look})
+        yield {"kind": "Marker", "name": name, "points": _fit(name, marker.points, *shapes), **look}
     for name, arrow in arrows.items():
         rows = {key: _fit(name, getattr(arrow, key), *shapes) for key in ("points", "vectors")}
         if not all(np.isfinite(array).all() for array in rows.values()):
             raise ValueError(f"arrow {name!r} must be finite")
         look = {"scale": arrow.scale, "radius": arrow.radius, "color": _ARROW, "threshold": 1e-3}
-        found.append({"kind": "Arrow", "name": name, **rows, **look})
+        yield {"kind": "Arrow", "name": name, **rows, **look}
     for word, at in words.items():
-        found.append({"kind": "Label", "name": word, "points": _fit(word, at, *shapes)})
-    return found
+        yield {"kind": "Label", "name": word, "points": _fit(word, at, *shapes)}
 
 
 def _fit(name: str, array: ArrayLike, *shapes: tuple[int, ...]) -> Array:

@@ -71,7 +71,7 @@ def visible(model: mujoco.MjModel, groups: Sequence[int]) -> dict[int, list[tupl
     """For each body, what is seen of the groups: geoms with any opacity, sites with a material."""
     found: dict[int, list[tuple[str, int]]] = {}
     for g in np.flatnonzero(np.isin(model.geom_group, groups)).tolist():
-        if _own_rgba(model, model.geom_rgba[g], int(model.geom_matid[g]))[3] > 0.0:
+        if shown_rgba(model, model.geom_rgba[g], int(model.geom_matid[g]))[3] > 0.0:
             found.setdefault(int(model.geom_bodyid[g]), []).append(("geom", g))
     for s in np.flatnonzero(np.isin(model.site_group, groups) & (model.site_matid >= 0)).tolist():
         found.setdefault(int(model.site_bodyid[s]), []).append(("site", s))
@@ -88,7 +88,8 @@ def transform(position: Array, quaternion: Array) -> Array:
 
 def shown_rgba(model: mujoco.MjModel, rgba: Array, material: int) -> _Rgba:
     """The own color, or the material's where that is the default, times the texture's mean."""
-    rgba = _own_rgba(model, rgba, material)
+    if material >= 0 and tuple(rgba) == _DEFAULT_RGBA:
+        rgba = model.mat_rgba[material]
     pixels = texture(model, material)
     if pixels is not None:
         step = max(1, pixels.shape[1] // 128)
@@ -117,10 +118,7 @@ def _three_object(
 
     name, kind, size = f"{what}{index}", _G(get("type")), get("size")
     material, data = (int(get("matid")), int(get("dataid"))) if what == "geom" else (-1, -1)
-    rgba, place = (
-        shown_rgba(model, get("rgba"), int(get("matid"))),
-        transform(get("pos"), get("quat")),
-    )
+    rgba, place = shown_rgba(model, get("rgba"), get("matid")), transform(get("pos"), get("quat"))
     found, scale = _triangles(model, kind, size, material, data), [1.0, 1.0, 1.0]
     mapped = found is not None and found[2] is not None
     shared = found is not None and kind in _MESHES and not mapped
@@ -156,17 +154,16 @@ def _three_object(
 
 def _material(kind: mujoco.mjtGeom, rgba: _Rgba, sides: int) -> dict[str, Any]:
     """A three.js material; `sides` is 2 for both sides of open shapes."""
-    opaque = rgba[3] == 1.0
     return {
         "type": "MeshPhongMaterial",
         "color": hexadecimal(rgba),
         "opacity": rgba[3],
-        "transparent": not opaque,
+        "transparent": rgba[3] < 1.0,
         "side": sides,
         "shininess": 35,
         "specular": 0x2A2A2A,
         "flatShading": kind in (*_MESHES, _G.mjGEOM_BOX),
-        "depthWrite": opaque,  # what lies behind a see-through wall is seen from every side
+        "depthWrite": rgba[3] == 1.0,  # what lies behind a see-through wall is seen from every side
         "polygonOffset": kind == _G.mjGEOM_PLANE,  # lines drawn on a floor stay visible
         "polygonOffsetFactor": 0,
         "polygonOffsetUnits": 4,
@@ -249,18 +246,12 @@ def _height_field(model: mujoco.MjModel, field: int) -> tuple[Array, NDArray[np.
 def _buffer(vertices: Array, faces: NDArray[np.integer], uv: Array | None) -> dict[str, Any]:
     """Triangles as a three.js geometry; numbers travel as extensions of msgpack."""
 
-    def pack(array: Any, kind: type, name: str, code: int) -> dict[str, Any]:
-        data = umsgpack.Ext(code, np.ascontiguousarray(array, dtype=kind).tobytes())
-        return {"itemSize": array.shape[1], "type": name, "array": data, "normalized": False}
+    def pack(array: Any, kind: str, code: int) -> dict[str, Any]:
+        data = umsgpack.Ext(code, np.ascontiguousarray(array, kind.lower()).tobytes())
+        return {"itemSize": array.shape[1], "type": f"{kind}Array", "array": data}
 
-    attributes = {"position": pack(vertices, np.float32, "Float32Array", 0x17)}
+    attributes = {"position": pack(vertices, "Float32", 0x17)}
     if uv is not None:
-        attributes["uv"] = pack(uv, np.float32, "Float32Array", 0x17)
-    index = pack(faces, np.uint32, "Uint32Array", 0x16)
+        attributes["uv"] = pack(uv, "Float32", 0x17)
+    index = pack(faces, "Uint32", 0x16)
     return {"type": "BufferGeometry", "data": {"attributes": attributes, "index": index}}
-
-
-def _own_rgba(model: mujoco.MjModel, rgba: Array, material: int) -> Array:
-    """The own color (4,), or the material's where that is the default."""
-    unset = material >= 0 and tuple(rgba) == _DEFAULT_RGBA
-    return model.mat_rgba[material] if unset else rgba

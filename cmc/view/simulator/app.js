@@ -1,5 +1,5 @@
 "use strict";
-// The page around the worlds: panes, controls, dragging, a strip chart. PAGE is what page.py writes.
+// The page around the worlds: panes, controls, dragging, a strip chart. PAGE is what `live_page` writes.
 const live = { ready: false, states: null, failed: null };  // what tests look at
 (() => {
 const byId = (id) => document.getElementById(id);

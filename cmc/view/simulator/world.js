@@ -80,7 +80,7 @@ function lowLevel(low, latent, integral) {
 
 // ---- the world ----------------------------------------------------------------------------------
 class World {
-  // task: what `simulator/page.py` writes; mj: the loaded MuJoCo module.
+  // task: what `cmc.studies.live` writes; mj: the loaded MuJoCo module.
   constructor(mj, task) {
     this.mj = mj;
     this.task = task;
