@@ -60,13 +60,11 @@ class HierarchyConfig:
     capacity: int = 65536  # segments that the planner remembers, `tab:para`
 
     def __post_init__(self) -> None:
-        if min(self.worlds, self.samples, self.capacity) < 1:
-            raise ValueError(f"worlds, samples and capacity must be at least 1: {self}")
-        if min(self.high_updates, self.low_updates, self.warm_up) < 0:
-            raise ValueError(f"updates and warm_up must not be negative: {self}")
+        if min(self.worlds, self.samples, self.capacity, self.noise_steps) < 1:
+            raise ValueError(f"worlds, samples, capacity, noise_steps: wanted 1 or more: {self}")
         noise = (self.high_noise, self.high_noise_end or 0.0)
-        if min(noise) < 0 or self.noise_steps < 1:
-            raise ValueError(f"wanted noise of at least 0 and noise_steps of at least 1: {self}")
+        if min(self.high_updates, self.low_updates, self.warm_up, *noise) < 0:
+            raise ValueError(f"updates, warm_up and noise: wanted 0 or more: {self}")
         if not all(0 <= share <= 1 for share in (*self.redraw, *self.burst)):
             raise ValueError(f"redraw and burst: wanted probabilities, got {self}")
         if self.rate_steps is not None and not 0 <= self.rate_steps[0] < self.rate_steps[1]:
@@ -102,10 +100,8 @@ class TwoLevel(Resumable):
     Args:
         task: len(seeds) * config.worlds worlds, those of a seed side by side.
         seeds: one integer for each seed.
-        planner: TD3 on the planner's normalized observations.
-        low: the low level.
-        planning: normalization.
-        config: rates and sizes.
+        planner, low: TD3 on the planner's normalized observations, and the low level.
+        planning, config: normalization, rates and sizes.
         relabeller: changes the sub-goals of the planner's samples, or None.
     """
 
@@ -147,18 +143,17 @@ class TwoLevel(Resumable):
     def segment(self) -> Array:
         """One sub-goal, its ticks, and the updates that are due; mean rewards (seeds,)."""
         task, planning = self.task, self.planning
-        seen = planning.observe(task, self._obs)
-        middle = planning.direction(task, self._obs)
-        action = self._choose(self._split(seen), self._split(middle) if middle.ndim else middle)
+        seen = self._split(planning.observe(task, self._obs))
+        action = self._choose(seen)
         obs = task.set_subgoal(planning.subgoal(action.reshape(task.num, -1)))
         last: dict[str, Any] = {}
         segment, reward, self._obs, over = rollout(
             task, self.low, obs, self.shape, explore=True, watch=last.update
         )
-        following = planning.observe(task, self._obs)
+        following = self._split(planning.observe(task, self._obs))
         gain = self.config.reward_scale * reward
         # An episode ends by its time limit only: the next value always counts.
-        parts = (self._split(seen), action, gain, self._split(following), np.ones_like(gain))
+        parts = (seen, action, gain, following, np.ones_like(gain))
         self.replay.add(*parts, self.relabeller.pack(segment) if self.relabeller else None)
         self.low.record(segment)
         before = self.steps
@@ -169,11 +164,13 @@ class TwoLevel(Resumable):
             self._obs = task.reset()
         return reward.mean(1)
 
-    def _choose(self, seen: Array, middle: Array) -> Array:
+    def _choose(self, seen: Array) -> Array:
         """The planner's action with noise, or a random one at first; (seeds, worlds, size)."""
         count = (self.config.worlds, len(self.planning.low))
         if self.steps < self.config.warm_up:
+            middle = self.planning.direction(self.task, self._obs)
             drawn = np.stack([g.uniform(-1.0, 1.0, count) for g in self.streams])
+            middle = self._split(middle) if middle.ndim else middle
             return np.clip(middle + drawn, -1.0, 1.0)
         noise, redraw, burst = self.config.exploration(self.steps)
         action = evaluate(self.planner.actor, seen)
@@ -204,6 +201,10 @@ class TwoLevel(Resumable):
         low = self.low.actor
         return {"planner": self.planner.actor} | ({} if low is None else {"low": low})
 
+    def acting(self) -> tuple[nn.Module, LowLevel]:
+        """Planner and low level as they are now."""
+        return self.planner.actor.eval(), self.low
+
     def state(self) -> State:
         """Both levels, memory, physics, random streams."""
         arrays, record = super().state()
@@ -230,9 +231,7 @@ def play(
 
     Args:
         task: S * M worlds, those of a seed side by side; its random streams decide the starts.
-        planning: normalization.
-        planner: sub-goals in [-1, 1] from (S, M, size).
-        low: the low level.
+        planning, planner, low: normalization; sub-goals in [-1, 1] from (S, M, size); actions.
         seeds: how many trained seeds S the networks hold.
         keep: names out of what `task.step` tells (`reward`, `observation`, `success`,
             `contact_force`, ...), `distance` to the goal (m), and the worlds' `tip`, `target` (the

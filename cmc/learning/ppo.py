@@ -79,10 +79,8 @@ class PPO(Resumable):
         self.env, self.policy, self.config = env, policy, config or PPOConfig()
         self.seeds = tuple(int(seed) for seed in seeds)
         if not self.seeds or env.num_envs % len(self.seeds):
-            raise ValueError(
-                f"wanted at least one seed, a number that divides {env.num_envs} trajectories; "
-                f"got {len(self.seeds)}"
-            )
+            wanted = f"at least one, a number that divides {env.num_envs} trajectories"
+            raise ValueError(f"seeds: wanted {wanted}; got {len(self.seeds)}")
         first, info = env.reset(seed=self._environment_seeds(0))
         inputs = info.get("privileged", first).shape[-1]
         self.critic = StackedMLP(inputs, 1, self.config.critic_hidden, seeds=self.seeds, last=0.1)

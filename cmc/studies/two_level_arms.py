@@ -12,7 +12,7 @@ from torch import nn
 
 from cmc.envs.panda_task import PandaTask
 from cmc.learning.hierarchy import TwoLevel
-from cmc.learning.hiro import JointLow, JointUnits, Normalised, OffPolicyCorrection, PullActor
+from cmc.learning.hiro import JointLow, JointUnits, OffPolicyCorrection, PullActor
 from cmc.learning.latent import LatentLow
 from cmc.learning.low_level import CriticLow, LowLevel, latent_policy, set_gain
 from cmc.learning.planning import CriticView, OneLevelPPO, Planning, SegmentEnv
@@ -113,28 +113,12 @@ def joints(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
 # -- trainings ------------------------------------------------------------------------------------
 
 
-class TwoLevelTraining(TwoLevel):
-    """`TwoLevel` for a study's runner."""
-
-    def acting(self) -> Policy:
-        """Planner and low level as they are now, without exploration and learning."""
-        return self.planner.actor.eval(), still(self.low)
-
-
-class OneLevelTraining(OneLevelPPO):
-    """`OneLevelPPO` for a study's runner."""
-
-    def acting(self) -> Policy:
-        """The planner, and no action below it."""
-        return self.policy.eval(), self.low
-
-
 def two_level(
     low_level: Builder, relabel: bool = False
-) -> Callable[[TwoLevelConfig, Seeds], TwoLevelTraining]:
+) -> Callable[[TwoLevelConfig, Seeds], TwoLevel]:
     """A planner that learns by TD3 over a low level; relabelled sub-goals are HIRO's."""
 
-    def build(config: TwoLevelConfig, seeds: Seeds) -> TwoLevelTraining:
+    def build(config: TwoLevelConfig, seeds: Seeds) -> TwoLevel:
         task, planning, actor, inputs = _planner(config, seeds)
         view = CriticView(task, planning) if config.relative else None
         agent = TD3(actor, seeds, inputs, len(planning.low), config.planner, stream=1, view=view)
@@ -142,17 +126,17 @@ def two_level(
         horizon, correction = config.task.horizon, None
         if relabel:
             correction = OffPolicyCorrection(low, seeds, horizon, min(config.joint_stride, horizon))
-        return TwoLevelTraining(task, seeds, agent, low, planning, config.hierarchy, correction)
+        return TwoLevel(task, seeds, agent, low, planning, config.hierarchy, correction)
 
     return build
 
 
-def one_level(config: TwoLevelConfig, seeds: Seeds) -> OneLevelTraining:
+def one_level(config: TwoLevelConfig, seeds: Seeds) -> OneLevelPPO:
     """A planner that learns by PPO, without a low level."""
     task, planning, actor, _ = _planner(config, seeds)
     env = SegmentEnv(task, planning, config.hierarchy.reward_scale)
     whole = replace(config.ppo, steps=config.task.ticks // config.task.horizon)
-    return OneLevelTraining(env, actor, seeds, whole)
+    return OneLevelPPO(env, actor, seeds, whole)
 
 
 def _planner(config: TwoLevelConfig, seeds: Seeds) -> tuple[PandaTask, Planning, DirectPolicy, int]:
@@ -161,13 +145,6 @@ def _planner(config: TwoLevelConfig, seeds: Seeds) -> tuple[PandaTask, Planning,
     inputs, hidden = planning.observe(task, task.reset()).shape[-1], config.planner_hidden
     network = JointNetwork(len(planning.low), inputs=inputs, hidden=hidden, seeds=seeds, last=1.0)
     return task, planning, DirectPolicy(network, squash=True), inputs
-
-
-def still(low: LowLevel) -> LowLevel:
-    """A low level as it is now, without exploration and learning."""
-    if isinstance(low, JointLow):
-        return LowLevel(Normalised(low.agent.actor, low.units), len(low.units.start))
-    return LowLevel(low.actor)
 
 
 # -- methods --------------------------------------------------------------------------------------
