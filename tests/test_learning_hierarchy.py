@@ -12,7 +12,7 @@ from cmc.envs.peg_maze import PegMaze
 from cmc.learning.hierarchy import HierarchyConfig, play
 from cmc.learning.planning import SegmentEnv
 from cmc.studies import peg_maze, peg_push
-from cmc.studies.two_level_arms import frozen, latent, two_level
+from cmc.studies.two_level import frozen, latent, two_level
 
 MAZE, PUSH = peg_maze.STUDY.config, peg_push.STUDY.config
 

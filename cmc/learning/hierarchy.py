@@ -231,7 +231,9 @@ def play(
 
     Args:
         task: S * M worlds, those of a seed side by side; its random streams decide the starts.
-        planning, planner, low: normalization; sub-goals in [-1, 1] from (S, M, size); actions.
+        planning: normalization.
+        planner: sub-goals in [-1, 1] from (S, M, size).
+        low: the low level.
         seeds: how many trained seeds S the networks hold.
         keep: names out of what `task.step` tells (`reward`, `observation`, `success`,
             `contact_force`, ...), `distance` to the goal (m), and the worlds' `tip`, `target` (the

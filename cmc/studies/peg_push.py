@@ -47,8 +47,7 @@ from cmc.learning.ppo import PPOConfig
 from cmc.learning.td3 import TD3Config
 from cmc.studies.peg_maze import TESTS
 from cmc.studies.study import Study, Test, changed, last
-from cmc.studies.two_level import TwoLevelConfig, light
-from cmc.studies.two_level_arms import METHODS
+from cmc.studies.two_level import METHODS, TwoLevelConfig, light
 from cmc.studies.two_level_tests import judge, motion
 
 TIME_CONSTANT = 0.01

@@ -64,40 +64,25 @@ def both(*steps: Change) -> Change:
 
 @dataclass(frozen=True)
 class Method:
-    """One arm of a study.
+    """One arm of a study."""
 
-    Attributes:
-        title: in figures and tables.
-        build: its untrained training, from the configuration and the seeds.
-        adapt: the study's configuration to the method's own.
-        trained: False for fixed gains.
-    """
-
-    title: str
-    build: Callable[[Any, Sequence[int]], Training]
-    adapt: Change = same
-    trained: bool = True
+    title: str  # in figures and tables
+    build: Callable[[Any, Sequence[int]], Training]  # from its configuration and the seeds
+    adapt: Change = same  # the study's configuration to the method's own
+    trained: bool = True  # False for fixed gains
 
 
 @dataclass(frozen=True)
 class Test:
-    """One condition under which kept policies are tested.
-
-    Attributes:
-        name: in tables; several tests of other policies may share it.
-        number: episodes of each seed.
-        change: the method's configuration to that of the test.
-        when: which of the kept policies are tested, from their steps in rising order.
-        methods: names; all if None.
-    """
+    """One condition under which kept policies are tested."""
 
     __test__ = False  # not a pytest class
 
-    name: str
-    number: int
-    change: Change = same
-    when: Callable[[Sequence[int]], Iterable[int]] = same
-    methods: tuple[str, ...] | None = None
+    name: str  # in tables; several tests of other policies may share it
+    number: int  # episodes of each seed
+    change: Change = same  # the method's configuration to that of the test
+    when: Callable[[Sequence[int]], Iterable[int]] = same  # which of the kept policies' steps
+    methods: tuple[str, ...] | None = None  # names; all if None
 
 
 def last(marks: Sequence[int]) -> Sequence[int]:
@@ -114,37 +99,24 @@ def before_last(marks: Sequence[int]) -> Sequence[int]:
 class Study:
     """Methods, the configuration that they share, and how they are tested.
 
-    Attributes:
-        name: of the study, its files and its folder.
-        about: one line.
-        config: a frozen dataclass that everything in a run depends on.
-        methods: by name.
-        tests: what `evaluate` does.
-        length: of a training, of each seed.
-        every: how far apart policies are kept.
-        judge: one test of one policy: (config, policy, seeds, test) to rows by table; `seed` is a
-            position in a row.
-        motion: one episode as arrays, for `play`: (config, policy of one seed, number of the start)
-            to `text` and what the picture needs.
-        light: a configuration that builds faster and acts the same, for loading.
-        shown: of which kept policies tables other than `tests` are kept.
-        unit: what `length` counts, and the name of its column in tables.
-        gain: what a training's curve shows, and the name of its column.
+    `judge` makes one test of one policy: (config, policy, seeds, test) to rows by table, in which
+    `seed` is a position. `motion` records one episode for `play`: (config, policy of one seed,
+    number of the start) to `text` and what the picture needs.
     """
 
-    name: str
-    about: str
-    config: Any
+    name: str  # of the study, its files and its folder
+    about: str  # one line
+    config: Any  # a frozen dataclass that everything in a run depends on
     methods: Mapping[str, Method]
     tests: tuple[Test, ...]
-    length: int
-    every: int
+    length: int  # of a training, of each seed
+    every: int  # how far apart policies are kept
     judge: Callable[[Any, Any, int, Test], dict[str, Rows]]
     motion: Callable[[Any, Any, int], dict[str, Any]]
-    light: Change = same
-    shown: Callable[[Sequence[int]], Iterable[int]] = last
-    unit: Literal["step", "episode"] = "step"
-    gain: Literal["reward", "return"] = "reward"
+    light: Change = same  # a configuration that builds faster and acts the same, for loading
+    shown: Callable[[Sequence[int]], Iterable[int]] = last  # whose tables but `tests` are kept
+    unit: Literal["step", "episode"] = "step"  # what `length` counts, and its column in tables
+    gain: Literal["reward", "return"] = "reward"  # what a training's curve shows, and its column
 
     def method(self, name: str) -> Method:
         """The method of this name; a ValueError names the others if there is none."""

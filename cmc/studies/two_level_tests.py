@@ -14,8 +14,7 @@ from cmc.learning.low_level import LowLevel, low_fields
 from cmc.policies import PositiveNetwork
 from cmc.robot.panda import FINGERTIP, JOINTS, inverse_kinematics
 from cmc.studies.study import Array, Rows, Test, same
-from cmc.studies.two_level import TwoLevelConfig
-from cmc.studies.two_level_arms import N, Policy
+from cmc.studies.two_level import N, Policy, TwoLevelConfig
 
 TEST_SEED = 900_000  # test worlds never share a stream with training
 PUSH = 2.0
