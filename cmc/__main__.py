@@ -152,6 +152,7 @@ def _evaluate(chosen: argparse.Namespace) -> None:
     from cmc.studies.evaluation import evaluate, summary
 
     if chosen.study in studies.TABLES:
+        _refuse(chosen, ("method", "trajectories", "checkpoints", "json"), "not for a table")
         data = importlib.import_module(f"cmc.studies.{chosen.study}").table()
         seeds = sorted({int(seed) for seed in data["seed"]})
         record = store.provenance(f"python -m cmc evaluate {chosen.study}", seeds)
@@ -191,7 +192,10 @@ def _play(chosen: argparse.Namespace) -> None:
 
     study = studies.get(chosen.study)
     method = chosen.method or next(iter(study.methods))
-    if chosen.live or chosen.beside:
+    if chosen.live or chosen.beside is not None:
+        _refuse(
+            chosen, ("checkpoint", "episode"), "not with a live page, which has shipped policies"
+        )
         _live(study, method, chosen)
         return
     if chosen.episode < 0:
@@ -199,10 +203,7 @@ def _play(chosen: argparse.Namespace) -> None:
     seed = chosen.seed if study.method(method).trained else None
     found = load(study, method, seed=seed, path=chosen.checkpoint)
     motion = study.motion(study.config_of(method), found.policy, chosen.episode)
-    wanted = (".html", ".npz") if "model" in motion else (".png",)
-    out = chosen.out or Path(f"play{wanted[0]}")
-    if out.suffix not in wanted:
-        raise ValueError(f"--out: wanted a {' or '.join(wanted)} file, got {out}")
+    out = _out(chosen.out, *((".html", ".npz") if "model" in motion else (".png",)))
     about = f"{study.name}, {study.method(method).title}, seed {found.seeds[0]}"
     motion |= {"text": f"{about}: {motion['text']}"}
     if out.suffix == ".png":
@@ -217,6 +218,21 @@ def _play(chosen: argparse.Namespace) -> None:
     print(f"{motion['text']}\n{out}")
 
 
+def _refuse(chosen: argparse.Namespace, names: Sequence[str], why: str) -> None:
+    """Raise where an option was given that would not count."""
+    for name in names:
+        if getattr(chosen, name):
+            raise ValueError(f"--{name}: {why}")
+
+
+def _out(path: Path | None, *kinds: str) -> Path:
+    """The file that was asked for, or `play` of the first kind."""
+    path = path or Path(f"play{kinds[0]}")
+    if path.suffix not in kinds:
+        raise ValueError(f"--out: wanted a {' or '.join(kinds)} file, got {path}")
+    return path
+
+
 def _live(study: Study, method: str, chosen: argparse.Namespace) -> None:
     """A page with MuJoCo in it: one arm under its planner, or two that take the same sub-goals."""
     from cmc.studies import live
@@ -225,7 +241,7 @@ def _live(study: Study, method: str, chosen: argparse.Namespace) -> None:
     first = [method] if chosen.beside is None else [method, chosen.beside]
     policies = live.live_policies(study, live.playable(study, first))
     title = f"{study.name}: " + " beside ".join(study.method(name).title for name in first)
-    task, out = live.live_task(study), chosen.out or Path("live.html")
+    task, out = live.live_task(study), _out(chosen.out or Path("live.html"), ".html")
     page = live_page(task, policies, title=title, arms=len(first), seed=chosen.seed).encode()
     store.write_atomic(out, lambda file: file.write(page))
     print(f"{title}\n{out}")

@@ -64,6 +64,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from cmc import store
+from cmc.theory.arrays import checked
 
 TABLES = {
     "tests": "a row for each method, test, kept policy and seed",
@@ -84,8 +85,6 @@ def tidy(study: str, table: str = "tests") -> pd.DataFrame:
     Raises:
         ValueError: if there is no such table of this study, or the file is damaged.
     """
-    if table not in TABLES:
-        raise ValueError(f"table: wanted one of {', '.join(TABLES)}, got {table!r}")
     wanted = file_name(study, table)
     there = sorted(path.stem for path in store.asset("results").glob("*.csv"))
     if wanted.removesuffix(".csv") not in there:
@@ -95,31 +94,33 @@ def tidy(study: str, table: str = "tests") -> pd.DataFrame:
 
 def file_name(study: str, table: str) -> str:
     """Name of a table's file."""
+    if not isinstance(study, str):
+        raise ValueError(f"study: wanted a name, got {study!r}")
+    if not isinstance(table, str) or table not in TABLES:
+        raise ValueError(f"table: wanted one of {', '.join(TABLES)}, got {table!r}")
     return f"{study}.csv" if table == "tests" else f"{study}_{table}.csv"
 
 
 def read(path: str | Path) -> pd.DataFrame:
-    """A table and its record (`attrs`) from a file that `write` made.
-
-    Raises:
-        ValueError: if the first line is no record.
-    """
-    with Path(path).open(encoding="utf-8") as file:
-        first = file.readline()
+    """A table and its record (`attrs`) from a file that `write` made; a ValueError for others."""
+    with store.as_path("path", path).open(encoding="utf-8") as file:
         try:
-            record = json.loads(first.removeprefix("#"))
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{path}: wanted a record in the first line, got {first!r}") from error
-        data = pd.read_csv(file)
+            record = json.loads(file.readline().removeprefix("#"))
+            data = pd.read_csv(file)
+        except ValueError as error:  # of JSON, of the text's code, of pandas
+            said = f"{path}: wanted a record in the first line and a table below it"
+            raise ValueError(f"{said} ({error})") from error
+    if not isinstance(record, dict) or not isinstance(data.index, pd.RangeIndex):
+        raise ValueError(f"{path}: wanted a record in the first line, and rows as long as the head")
     data.attrs = record
     return data
 
 
 def write(folder: str | Path, table: str, data: pd.DataFrame, record: Mapping[str, Any]) -> Path:
     """Write a table of `record["study"]`: CSV, six digits, below a line with the record."""
-    text = data.to_csv(index=False, float_format="%.6g", lineterminator="\n")
-    head = json.dumps(dict(record), allow_nan=False)
-    path = Path(folder) / file_name(record["study"], table)
+    head = store.as_json("record", record, "study")
+    path = store.as_path("folder", folder) / file_name(record["study"], table)
+    text = _table(data).to_csv(index=False, float_format="%.6g", lineterminator="\n")
     return store.write_atomic(path, lambda file: file.write(f"# {head}\n{text}".encode()))
 
 
@@ -134,10 +135,27 @@ def at(
         test: the test.
         h: control period of the test, s, where there are several.
     """
-    time = "step" if "step" in data else "episode"
+    time = "step" if "step" in _table(data, "last", "test") else "episode"
+    several = "h" in data and data["h"].nunique() > 1
+    asked = {"test": test} | ({"h": h} if several else {}) | ({} if when is None else {time: when})
+    for key, value in asked.items():
+        there = data[key].dropna().unique().tolist()
+        if value not in there:
+            name = "when" if key == time else key
+            raise ValueError(f"{name}: wanted one of {there}, got {value!r}")
     chosen = data[time].isin([when, 0]) if when is not None else data["last"]
-    chosen &= data["test"] == test
-    return data[chosen & (data["h"] == h)] if "h" in data else data[chosen]
+    chosen = chosen & (data["test"] == test)
+    return data[chosen & (data["h"] == h)] if several else data[chosen]
+
+
+def _table(data: Any, *columns: Any) -> pd.DataFrame:
+    """The one door for tables: a DataFrame that has these columns."""
+    if not isinstance(data, pd.DataFrame):
+        raise ValueError(f"data: wanted a table, as `tidy` answers, got {type(data).__name__}")
+    for name in columns:
+        if not isinstance(name, str) or name not in data:
+            raise ValueError(f"data has no column {name!r}; it has {', '.join(map(str, data))}")
+    return data
 
 
 def spread(data: pd.DataFrame, key: str, by: str | Sequence[str] = "method") -> pd.DataFrame:
@@ -155,8 +173,8 @@ def spread(data: pd.DataFrame, key: str, by: str | Sequence[str] = "method") -> 
     Raises:
         ValueError: if a seed has several rows in a group.
     """
-    keys = [by] if isinstance(by, str) else [*by]
-    data = data.dropna(subset=[key])
+    keys = [by] if isinstance(by, str) or not isinstance(by, Sequence) else [*by]
+    data = _figures(data, key, *(keys or [by]), "seed")
     if data.duplicated([*keys, "seed"]).any():
         raise ValueError(
             f"wanted one row for each seed in a group by {', '.join(keys)}, got several: choose "
@@ -171,6 +189,14 @@ def spread(data: pd.DataFrame, key: str, by: str | Sequence[str] = "method") -> 
     answer = pd.DataFrame.from_dict(found, orient="index")
     answer.index.names = keys
     return answer.astype({"seeds": int}) if found else answer
+
+
+def _figures(data: Any, key: str, *columns: Any) -> pd.DataFrame:
+    """The rows that have a figure, a finite number."""
+    x = _table(data, key, *columns)[key]
+    if not pd.api.types.is_numeric_dtype(x) or np.isinf(x.astype(float)).any():
+        raise ValueError(f"key: wanted a column of finite numbers, got {key!r}")
+    return data[x.notna()]
 
 
 def share(
@@ -195,7 +221,8 @@ def against(data: pd.DataFrame, arm: str, other: str, key: str = "success") -> p
     """
     pair = []
     for name in (arm, other):
-        rows = data[data["method"] == name].dropna(subset=[key])
+        rows = _figures(data, key, "method", "seed")
+        rows = rows[rows["method"] == name] if isinstance(name, str) else rows[:0]
         if rows.empty:
             there = ", ".join(data["method"].unique())
             raise ValueError(f"no {key} of {name!r}; there are {there}")
@@ -214,7 +241,12 @@ def compare(data: pd.DataFrame, comparisons: Iterable[tuple[str, str, str]]) -> 
     Returns:
         A row for each, with `p_holm`: p-values corrected by Holm for all that are in the list.
     """
-    named = list(comparisons)
+    try:
+        named = [(arm, other, key) for arm, other, key in comparisons]
+    except (TypeError, ValueError):
+        named = []
+    if not named:
+        raise ValueError(f"comparisons: wanted some (arm, other, key), got {comparisons!r}")
     answer = pd.DataFrame([against(data, *three) for three in named])
     answer.index = pd.MultiIndex.from_tuples(named, names=["method", "other", "key"])
     return answer.assign(p_holm=holm(answer["p"]))
@@ -222,7 +254,9 @@ def compare(data: pd.DataFrame, comparisons: Iterable[tuple[str, str, str]]) -> 
 
 def holm(p: ArrayLike) -> np.ndarray:
     """Holm's correction: max over j <= i of (m - j) p_(j) in rising order, at most 1."""
-    p = np.asarray(p, dtype=float)
+    p = checked("p", p, "tests", least=0.0)
+    if (p > 1).any():
+        raise ValueError(f"p: wanted probabilities, got {p.max()}")
     order = np.argsort(p)
     rising = np.maximum.accumulate((len(p) - np.arange(len(p))) * p[order])
     answer = np.empty_like(rising)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import copy
 import gc
+import sys
 from collections.abc import Sequence
 from operator import attrgetter
 from typing import Any, ClassVar
@@ -51,19 +52,10 @@ class _Modular:
     """What the policy classes share: an action that is a `ModularPolicy` on the observation.
 
     The observation is s, the flat (n, 2) array of (z_i, integral of z_i), or holds it where
-    `layout` says; n is the size of the action.
-
-    Args:
-        observation_space: a Box of one axis.
-        action_space: a Box of one axis, n entries.
-        lr_schedule: of the optimizers, given by the algorithm.
-        network_kwargs: for the network, such as `slope_min`, `slope_max` and `joint_cap`.
-        layout: see `ModularPolicy`, as are `R`, `normalise` and `integral`.
-        R: diagonal of R where the observation does not hold it.
-        normalise: divide by |R_ii| in place of taking the sign alone.
-        integral: False hides the integrals.
-        net_arch: hidden layers by key: of the networks ("pi") and of the critic ("vf" or "qf").
-        **kwargs: for the class of Stable-Baselines3.
+    `layout` says; n is the size of the action. Both spaces are a Box of one axis. `network_kwargs`
+    are for the network, such as `slope_min`, `slope_max` and `joint_cap`; `layout`, `R`,
+    `normalise` and `integral` for `ModularPolicy`; `net_arch` holds hidden layers by key: of the
+    networks ("pi") and of the critic ("vf" or "qf"); the rest is for Stable-Baselines3.
     """
 
     _where: ClassVar[str]  # for which algorithms the class is
@@ -92,18 +84,14 @@ class _Modular:
         _check_spaces(observation_space, action_space, layout)
         sizes: dict[str, Sequence[int]] = dict(self._hidden)
         if net_arch is not None:  # as in Stable-Baselines3, a key left out means no hidden layer
-            both = net_arch if isinstance(net_arch, dict) else dict.fromkeys(sizes, net_arch)
-            sizes = {name: both.get(name, ()) for name in sizes}
+            given = net_arch if isinstance(net_arch, dict) else dict.fromkeys(sizes, net_arch)
+            sizes = {name: given.get(name, ()) for name in sizes}
         self._modular = {"layout": layout, "R": R, "normalise": normalise, "integral": integral}
         self._modular |= {name: kwargs.pop(name) for name in self._more if name in kwargs}
-        self._asked = {
-            **self._modular,
-            "network_kwargs": dict(network_kwargs or {}),
-            "net_arch": {name: list(layers) for name, layers in sizes.items()},
-        }
-        super().__init__(
-            observation_space, action_space, lr_schedule, self._their_sizes(), **kwargs
-        )  # type: ignore[call-arg]
+        self._asked = {**self._modular, "network_kwargs": dict(network_kwargs or {})}
+        self._asked["net_arch"] = {name: list(layers) for name, layers in sizes.items()}
+        both = (observation_space, action_space)
+        super().__init__(*both, lr_schedule, self._their_sizes(), **kwargs)  # type: ignore[call-arg]
 
     def _their_sizes(self) -> Any:
         """Hidden layers as the class of Stable-Baselines3 builds them."""
@@ -137,11 +125,8 @@ class _ActorCritic(_Modular, ActorCriticPolicy):
         hidden = hidden[0] if self.network is ConvexGradientNetwork else hidden
         network = self.network(self.action_space.shape[0], hidden=hidden, **kwargs)
         self.action_net = ModularPolicy(network, **self._modular)
-        self.optimizer = self.optimizer_class(  # again, because a module was replaced
-            self.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
+        options: Any = {"lr": lr_schedule(1), **self.optimizer_kwargs}
+        self.optimizer = self.optimizer_class(self.parameters(), **options)  # a module is new
 
     @property
     def actor(self) -> ModularPolicy:
@@ -219,14 +204,18 @@ def _check_spaces(
     """Refuse spaces that hold no (n, 2) signals for n actions, or a layout that does not fit."""
     if not isinstance(action, spaces.Box) or len(action.shape) != 1:
         raise ValueError(f"wanted actions in a Box of one axis; got {action}")
-    n, shape = action.shape[0], seen.shape or ()
-    if layout is None and shape != (2 * n,):
+    n, shape = action.shape[0], getattr(seen, "shape", None) or ()
+    if not isinstance(seen, spaces.Box) or (layout is None and shape != (2 * n,)):
         raise ValueError(
             f"wanted observations of shape ({2 * n},), (z_i, integral of z_i) for each of "
-            f"{n} actions, or a layout; got {seen.shape}"
+            f"{n} actions, or a layout; got {shape or seen}"
         )
+    if not (layout is None or isinstance(layout, dict)) or layout == {}:
+        raise ValueError(f"layout: wanted slices by name, got {layout!r}")
     wanted = {"s": 2 * n, "R": n, "T_a": n * n}
     for name, part in (layout or {}).items():
+        if not isinstance(part, slice):
+            raise ValueError(f"layout: {name!r} needs a slice, got {part!r}")
         inside = range(*part.indices(shape[0])) if len(shape) == 1 else range(0)
         if name in wanted and (len(inside) != wanted[name] or (part.stop or 0) > shape[0]):
             raise ValueError(
@@ -248,9 +237,9 @@ def _normalisation(policy: nn.Module) -> Any:
 class _OnSignals:
     """A `ModularPolicy` as it acts in a loop: w pi((s - mean) / std), or w tanh(pi(...)).
 
-    VecNormalize (`scales`, or None) gives mean and std and clips: its slopes are 1/std times as
-    large, and vanish where it clips. An off-policy algorithm scales actions from [-1, 1] to the
-    action space (`box`, or None): w is half its width, its middle joins `u0`.
+    VecNormalize (`scales`) gives mean and std and clips: its slopes are 1/std times as large, and
+    vanish where it clips. An off-policy algorithm scales actions from [-1, 1] to the action space
+    (`box`): w is half its width, its middle joins `u0`.
     """
 
     def __init__(
@@ -289,10 +278,12 @@ class BatchedVecEnv(VecEnv):
     """A batched Gymnasium vector environment, one that restarts in the same step, as a `VecEnv`."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        if not isinstance(env, VectorEnv):
+            raise ValueError(f"env: wanted a vector environment of Gymnasium, got {env!r}")
         mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
         if mode != AutoresetMode.SAME_STEP:
             raise ValueError(
-                "wanted a vector environment that restarts in the same step (autoreset_mode="
+                "env: wanted a vector environment that restarts in the same step (autoreset_mode="
                 f"AutoresetMode.SAME_STEP), as Stable-Baselines3 expects; got {mode}"
             )
         self.env = env
@@ -349,3 +340,7 @@ class BatchedVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """No trajectory of a batch is wrapped."""
         return [False] * len(list(self._get_indices(indices)))
+
+
+for _name in ("actor_critic", "td3"):  # modules that files name which an earlier version saved
+    sys.modules.setdefault(f"{__name__}.{_name}", sys.modules[__name__])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from functools import reduce
+from operator import index
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -120,7 +121,7 @@ class Study:
 
     def method(self, name: str) -> Method:
         """The method of this name; a ValueError names the others if there is none."""
-        if name not in self.methods:
+        if not isinstance(name, str) or name not in self.methods:
             raise ValueError(f"unknown method {name!r}; wanted one of {', '.join(self.methods)}")
         return self.methods[name]
 
@@ -130,10 +131,27 @@ class Study:
 
     def build(self, name: str, seeds: Sequence[int]) -> Training:
         """A method's training, not yet begun."""
-        if len(seeds) == 0:
-            raise ValueError("seeds: wanted at least one, got none")
-        return self.method(name).build(self.config_of(name), seeds)
+        return self.method(name).build(self.config_of(name), checked_seeds(seeds))
 
     def variant(self, name: str, about: str, **changes: Any) -> Study:
         """This study under another name, with its configuration `changed`."""
         return replace(self, name=name, about=about, config=changed(**changes)(self.config))
+
+
+def checked_study(study: Any) -> Study:
+    """A study, or a ValueError that says how to get one."""
+    if not isinstance(study, Study):
+        raise ValueError(f"study: wanted a Study, as cmc.studies.get(name) is, got {study!r}")
+    return study
+
+
+def checked_seeds(seeds: Any) -> list[int]:
+    """Different integers from 0, at least one, or a ValueError."""
+    try:
+        given = list(seeds)
+        found = [index(seed) for seed in given if not isinstance(seed, bool)]
+    except TypeError:
+        found = given = []
+    if not found or min(found) < 0 or len(set(found)) < len(given):
+        raise ValueError(f"seeds: wanted at least one integer from 0, all different, got {seeds!r}")
+    return found

@@ -77,12 +77,12 @@ def _gains(config: TwoLevelConfig, low: LowLevel, seeds: int, k: int) -> dict[st
     actor = getattr(low, "actor", None)
     if config.task.command == "joint" or actor is None:
         return {}
-    net, slopes = getattr(actor, "network", None), slope_at_rest(config, low, seeds)[k]
-    found = {f"slope_{axis}": float(slopes[i]) for i, axis in enumerate(AXES)}
+    net, columns = getattr(actor, "network", None), {"slope": slope_at_rest(config, low, seeds)[k]}
     if isinstance(net, PositiveNetwork) and net.joint is not None:
-        cap = config.slope_cap()
-        found |= {f"cap_{axis}": float(cap[i]) for i, axis in enumerate(AXES)}
-    return found
+        columns["cap"] = config.slope_cap()
+    return {
+        f"{key}_{axis}": float(v[i]) for key, v in columns.items() for i, axis in enumerate(AXES)
+    }
 
 
 def slope_at_rest(config: TwoLevelConfig, low: LowLevel, seeds: int, eps: float = 1e-4) -> Array:
@@ -105,18 +105,16 @@ def consistency(
 ) -> dict[str, Array]:
     """Spread of the tip's displacement over one segment for one sub-goal, over starts and pushes.
 
-    In free space (the task without its obstacles) every world starts an episode anew, is moved by a
-    random sub-goal for one segment, so that it starts the next one elsewhere and in motion, and is
-    then asked for a step of 5 mm along -x. Afterwards it goes back to where that step began and
-    does it again while a force of `PUSH` newtons acts on the tip, in a direction drawn for each
-    start uniformly on the sphere and fixed for the segment. Starts and pushes are the same for all
-    seeds and methods. Sub-goals are not clamped here, so that the step is 5 mm everywhere.
+    In free space every world is moved by a random sub-goal for one segment, so that it starts the
+    next one elsewhere and in motion, and is then asked for a step of 5 mm along -x. It goes back to
+    where that step began and does it again while a force of `PUSH` newtons acts on the tip, in a
+    direction drawn for each start uniformly on the sphere and fixed for the segment. Starts and
+    pushes are the same for all seeds and methods; no sub-goal is clamped.
 
-    Returns:
-        Over starts, by seed, (seeds,) each, m: `moved_mm`, the mean displacement along the step,
-        and `moved_x_mm`, ... in x, y, z; `starts_mm`, the root of the summed variances of the
-        displacement; `push_mm`, the root mean square distance between the ends of the segment with
-        the push and without it from the same start. (Names are those of the columns, in mm.)
+    Returns, by seed (seeds,) and in m (names are those of the columns, in mm): `moved_mm`, the mean
+    displacement along the step, and `moved_x_mm`, ... in x, y, z; `starts_mm`, the root of the
+    summed variances of the displacement over starts; `push_mm`, the root mean square distance
+    between the segment's ends with the push and without it.
     """
     bounds: dict[str, Any] = {}  # none that would shorten a step near the edge
     for name in ("subgoal", "workspace"):
