@@ -29,21 +29,14 @@ Array = NDArray[np.float64]
 class HierarchyConfig:
     """Rates and sizes of the two levels; our choice where no table is named.
 
-    Attributes:
-        samples: environment steps of a seed between rounds of updates, which are spread evenly over
-            the segments.
-        redraw: probability that an entry of a sub-goal is replaced by a uniform draw, at first and
-            once it has fallen.
-        burst: probability that a world begins `burst_segments` uniform sub-goals in a row, at first
-            and once it has fallen.
-        rate_steps: environment steps of a seed between which the planner's Adam rates fall,
-            linearly, to a tenth, or None if they stay.
-        warm_up: environment steps of a seed with random sub-goals, from which the low level alone
-            learns.
+    Steps are environment steps of a seed. Updates are spread evenly over the segments. An entry of
+    a sub-goal is drawn anew with a probability (`redraw`) that falls linearly from the first to the
+    second value, and with another one (`burst`) a world begins `burst_segments` uniform sub-goals
+    in a row.
     """
 
     worlds: int = 8  # of each seed
-    samples: int = 1024  # `tab:para`
+    samples: int = 1024  # steps between rounds of updates, `tab:para`
     high_updates: int = 100  # of the planner in a round, `tab:para`
     low_updates: int = 100  # of the low level in a round
     low_updates_late: int | None = None  # the same from `low_late` on, or None if they stay
@@ -53,9 +46,9 @@ class HierarchyConfig:
     redraw: tuple[float, float] = (0.0, 0.0)
     burst: tuple[float, float] = (0.0, 0.0)
     burst_segments: int = 3
-    noise_steps: int = 500_000  # steps of a seed until noise, redraws and bursts have fallen
-    rate_steps: tuple[int, int] | None = None
-    warm_up: int = 10_000
+    noise_steps: int = 500_000  # until noise, redraws and bursts have fallen
+    rate_steps: tuple[int, int] | None = None  # between which the planner's rates fall to a tenth
+    warm_up: int = 10_000  # steps with random sub-goals, from which the low level alone learns
     reward_scale: float = 1.0  # factor on the mean reward of a segment
     capacity: int = 65536  # segments that the planner remembers, `tab:para`
 
@@ -97,12 +90,8 @@ class HierarchyConfig:
 class TwoLevel(Resumable):
     """Trains a planner and a low level on one task, several seeds side by side.
 
-    Args:
-        task: len(seeds) * config.worlds worlds, those of a seed side by side.
-        seeds: one integer for each seed.
-        planner, low: TD3 on the planner's normalized observations, and the low level.
-        planning, config: normalization, rates and sizes.
-        relabeller: changes the sub-goals of the planner's samples, or None.
+    The task has len(seeds) * config.worlds worlds, those of a seed side by side; the planner is TD3
+    on observations that `planning` normalizes; `relabeller` may change the sub-goals it samples.
     """
 
     kept = ("steps", "burst", "streams", "planner", "replay", "low", "relabeller")
@@ -229,19 +218,11 @@ def play(
 ) -> dict[str, Array]:
     """One episode of every world without exploration, and what is kept of every tick.
 
-    Args:
-        task: S * M worlds, those of a seed side by side; its random streams decide the starts.
-        planning: normalization.
-        planner: sub-goals in [-1, 1] from (S, M, size).
-        low: the low level.
-        seeds: how many trained seeds S the networks hold.
-        keep: names out of what `task.step` tells (`reward`, `observation`, `success`,
-            `contact_force`, ...), `distance` to the goal (m), and the worlds' `tip`, `target` (the
-            sub-goal), `qpos` and `force` (3,).
-        ticks: in place of the whole episode, in whole segments.
-
-    Returns:
-        Arrays (T, S, M, ...) by name, taken after each tick.
+    The task has S * M worlds, those of a seed side by side, and its random streams decide the
+    starts; the planner maps (S, M, size) to sub-goals in [-1, 1]; `seeds` is S. `keep` are names of
+    what `task.step` tells (`reward`, `observation`, `success`, `contact_force`, ...), `distance` to
+    the goal (m), and the worlds' `tip`, `target` (the sub-goal), `qpos` and `force` (3,). `ticks`
+    replace the whole episode, in whole segments. Returns arrays (T, S, M, ...) by name.
     """
     kept: dict[str, list[Array]] = {name: [] for name in keep}
     shape = (seeds, task.num // seeds)

@@ -134,11 +134,8 @@ class JointLow(CriticLow):
 class OffPolicyCorrection(Kept):
     """Stores whole segments with the planner's transitions and relabels what is drawn.
 
-    Args:
-        low: the low level whose present policy decides.
-        seeds: one integer for each seed.
-        horizon: ticks T of a segment.
-        stride: ticks between those whose likelihood counts (1: all, as in the source).
+    The present policy of `low` decides. A segment has `horizon` ticks T, and every `stride`-th of
+    them counts (1: all, as in the source).
     """
 
     kept = ("streams",)

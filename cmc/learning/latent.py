@@ -31,9 +31,8 @@ Array = NDArray[np.float64]
 class LatentConfig:
     """Loss and optimizer of the latent rollout (all our choice).
 
-    Attributes:
-        cap: what (K_d + g K2) dt is kept below by construction: below 1 an error does not change
-            sides from tick to tick, which in contact is felt well before chatter starts at 2.
+    (K_d + g K2) dt is kept below `cap` by construction: below 1 an error does not change sides from
+    tick to tick, which in contact is felt well before chatter starts at 2.
     """
 
     rate: float = 2e-3  # Adam's

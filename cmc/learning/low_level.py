@@ -28,17 +28,11 @@ CAPACITY = 65536
 
 @dataclass(frozen=True)
 class Segment:
-    """The ticks of every world between two sub-goals; T ticks, N worlds of each seed.
+    """The ticks of every world between two sub-goals; T ticks, N worlds of each seed."""
 
-    Attributes:
-        observation: before each tick, and after the last, (T + 1, seeds, N, size).
-        action: (T, seeds, N, n), in [-1, 1].
-        tracking: minus the distances to the sub-goal, by name, (T, seeds, N).
-    """
-
-    observation: Array
-    action: Array
-    tracking: dict[str, Array]
+    observation: Array  # before each tick, and after the last, (T + 1, seeds, N, size)
+    action: Array  # (T, seeds, N, n), in [-1, 1]
+    tracking: dict[str, Array]  # minus the distances to the sub-goal, by name, (T, seeds, N)
 
 
 class LowLevel(Kept):
@@ -68,15 +62,9 @@ class LowLevel(Kept):
 class CriticLow(LowLevel):
     """A low level that learns from a critic, as the paper's does.
 
-    Args:
-        agent: actor and critics.
-        seeds: one integer for each seed.
-        size: how many leading entries of an observation the critics see.
-        noise: standard deviation of the exploration noise.
-        whole_return: whether the critics learn the rest of the segment's return as it came instead
-            of one-step targets; the segment's end is terminal in both.
-        weights: what each tracking term counts.
-        n: size of an action.
+    Critics see the first `size` entries of an observation, and learn one-step targets, or, with
+    `whole_return`, the rest of the segment's return as it came; the segment's end is terminal in
+    both. `weights` are what each tracking term counts, `noise` is the deviation of the exploration.
     """
 
     kept = ("agent", "replay", "streams")

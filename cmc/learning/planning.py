@@ -23,23 +23,14 @@ Array32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Planning:
-    """How a task's observations and sub-goals are normalized for the planner.
+    """How a task's observations and sub-goals are normalized for the planner."""
 
-    Attributes:
-        shift, scale: observation fields of the planner to (field - shift) * scale, by name; fields
-            that are not named stay as they are.
-        low, high: ends of the sub-goal's range, which the planner's [-1, 1] is mapped to.
-        fields: what the planner sees; the task's own `high_level` if None.
-        aim: joint angles around which the random sub-goals of the warm-up lie, (7,), for tasks
-            with joint increments; without it they lie around 0.
-    """
-
-    shift: Mapping[str, Array]
+    shift: Mapping[str, Array]  # fields to (field - shift) * scale, by name; others stay
     scale: Mapping[str, Array]
-    low: Array
+    low: Array  # ends of the sub-goal's range, which the planner's [-1, 1] is mapped to
     high: Array
-    fields: tuple[str, ...] | None = None
-    aim: Array | None = None
+    fields: tuple[str, ...] | None = None  # what the planner sees; the task's own if None
+    aim: Array | None = None  # joints around which the warm-up's sub-goals lie, (7,); 0 if None
 
     def observe(self, task: PandaTask, observation: Array) -> Array:
         """The planner's normalized view of observations (..., size)."""

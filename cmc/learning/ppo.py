@@ -57,14 +57,10 @@ class PPOConfig:
 class PPO(Resumable):
     """Train `policy` on `env` with several seeds at once.
 
-    Args:
-        env: a vector environment of S E trajectories, seed by seed; `reset` takes one integer a
-            seed (a single integer if S = 1). A critic sees `info["privileged"]` where there is one
-            and the observation otherwise.
-        policy: module from observations (S, batch, d) to mean commands (S, batch, n), built with
-            the same seeds.
-        seeds: one non-negative integer for each seed.
-        config: hyperparameters.
+    The vector environment has S E trajectories, seed by seed; its `reset` takes one integer a seed
+    (a single integer if S = 1). A critic sees `info["privileged"]` where there is one and the
+    observation otherwise. The policy maps observations (S, batch, d) to mean commands (S, batch, n)
+    and is built with the same seeds.
     """
 
     kept = ("updates",)

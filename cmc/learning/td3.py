@@ -29,12 +29,8 @@ View = Callable[[Tensor, Tensor], Tensor]
 class TD3Config:
     """Settings of one learner; defaults are the paper's `tab:para` unless marked.
 
-    Attributes:
-        action_gradient_clip: bound on each entry of dQ/da, or None.
-        gradient_clip: bound on the norm of each parameter's gradient, seed by seed, or None.
-        critic_head_start: critic updates before the actor first moves (our choice: 0).
-        pull: weight of the mean square of the actor's values before its last tanh, which keeps
-            them where tanh still has a slope (our choice: 0).
+    `pull` weighs the mean square of the actor's values before its last tanh, which keeps them where
+    tanh still has a slope.
     """
 
     actor_rate: float = 1e-4  # of Adam; the table calls it the target learning rate
@@ -43,14 +39,14 @@ class TD3Config:
     target_rate: float = 0.005  # part of the way that targets move at each target update
     target_period: int = 50  # critic updates between target updates
     actor_period: int = 2  # and between actor updates, TD3's default
-    action_gradient_clip: float | None = None
-    gradient_clip: float | None = None
+    action_gradient_clip: float | None = None  # bound on each entry of dQ/da
+    gradient_clip: float | None = None  # on the norm of each parameter's gradient, seed by seed
     target_noise: float = 0.2  # deviation of the noise on target actions, TD3's default
     target_noise_clip: float = 0.5  # and its bound
     critic_hidden: tuple[int, ...] = (128, 128)  # our choice; the paper's are 400, 300
     batch: int = 128  # transitions of each seed in one update
-    critic_head_start: int = 0
-    pull: float = 0.0
+    critic_head_start: int = 0  # critic updates before the actor first moves (our choice)
+    pull: float = 0.0  # our choice
 
     def __post_init__(self) -> None:
         positive = (self.actor_rate, self.critic_rate, self.target_period, self.actor_period)
@@ -63,14 +59,9 @@ class TD3Config:
 class TD3(Kept):
     """One actor and twin critics for each seed.
 
-    Args:
-        actor: maps observations (seeds, batch, size) to actions in [-1, 1] (seeds, batch, action);
-            with `pull` they are tanh(actor.unsquashed(observation)).
-        seeds: one integer for each seed.
-        observation, action: sizes.
-        config: settings.
-        stream: separates learners that share their seeds (two levels, say).
-        view: what the critics see of observations and actions; both as they are if None.
+    The actor maps observations (seeds, batch, size) to actions in [-1, 1] (seeds, batch, action);
+    with `pull` they are tanh(actor.unsquashed(observation)). `view` is what the critics see of
+    observations and actions; `stream` separates learners that share their seeds.
     """
 
     kept = ("updates", "streams")
