@@ -215,7 +215,7 @@ def test_edges_of_other_algorithms_spaces_and_layouts():
             algorithm(ContractingTD3Policy, peg)
     with pytest.raises(ValueError, match=r"wanted observations of shape \(2,\).*got \(3,\)"):
         TD3(ContractingTD3Policy, gymnasium.make("Pendulum-v1"), buffer_size=10)
-    with pytest.raises(ValueError, match="restarts in the same step"):
+    with pytest.raises(ValueError, match="env: wanted a restart in the same step"):
         BatchedVecEnv(gymnasium.make_vec(PEG, num_envs=2, vectorization_mode="sync"))
 
 

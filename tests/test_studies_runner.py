@@ -171,16 +171,27 @@ def test_wrong_requests_are_named(whole: Path, tmp_path: Path) -> None:
     for call, message in (
         (lambda: train(TOY, "run", out=tmp_path), "unknown method 'run'; wanted one of walk, fast"),
         (lambda: train(TOY, "walk", [], out=tmp_path), "seeds: wanted at least one"),
+        (lambda: train(TOY, "walk", [0, 0], out=tmp_path), "seeds: .* all different"),
+        (lambda: train(TOY, "walk", [1.5], out=tmp_path), "seeds: wanted .* integer"),
+        (lambda: train(TOY, "walk", out=3), "out: wanted a path, got 3"),
+        (lambda: train("toy", "walk"), "study: wanted a Study, as cmc.studies.get"),
+        (lambda: evaluate(TOY, "walk"), "names: wanted a list of methods, got 'walk'"),
+        (lambda: evaluate(TOY, [], folder=tmp_path), "names: wanted at least one"),
+        (lambda: load(TOY, "still", path=whole), "path: 'still' has fixed gains"),
+        (lambda: summary({}), "tables: wanted rows of `tests`"),
         (lambda: train(TOY, "still", out=tmp_path), "'still' has fixed gains"),
-        (lambda: train(TOY, "walk", length=0, out=tmp_path), "steps: wanted at least 1, got 0"),
-        (lambda: load(TOY, "walk", 31, path=whole), r"step: wanted one of \[30, 60, 90, 100\]"),
+        (lambda: train(TOY, "walk", length=0, out=tmp_path), r"length \(steps\) needs .* got 0"),
+        (
+            lambda: load(TOY, "walk", 31, path=whole),
+            r"mark \(step\): wanted one of \[30, 60, 90, 100\]",
+        ),
         (lambda: load(TOY, "walk", seed=2, path=whole), "seed: wanted a position from 0 to 1"),
         (lambda: load(TOY, "fast", path=whole), "wanted a checkpoint of method 'fast'"),
-        (lambda: evaluate(TOY, trajectories=0), "trajectories: wanted at least 1"),
+        (lambda: evaluate(TOY, ["still"], trajectories=0), "trajectories needs"),
         (lambda: studies.get("toy"), "unknown study 'toy'; wanted one of peg_touch"),
         (lambda: sweep("peg_touch", ["sac"], [0]), "unknown method 'sac'"),
-        (lambda: sweep("peg_touch", ["cppo"], []), "seeds: wanted at least 1"),
-        (lambda: sweep("peg_touch", ["cppo"], [0], jobs=0), "jobs: wanted at least 1"),
+        (lambda: sweep("peg_touch", ["cppo"], []), "seeds: wanted at least one"),
+        (lambda: sweep("peg_touch", ["cppo"], [0], jobs=0), "jobs needs"),
         (lambda: sweep("peg_touch", ["cppo"], [0], backend="mpi"), "wanted 'loky' or 'dask'"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -232,8 +243,12 @@ def test_what_is_shipped_is_the_last_policy_and_rows_of_others_stay(tmp_path: Pa
     after = results.read(table)
     assert after[after["method"] == "walk"].equals(before[before["method"] == "walk"])
     assert set(after.loc[after["method"] == "fast", "seed"]) == {0, 1, 2}
-    with pytest.raises(FileNotFoundError, match="no checkpoint of toy in"):
-        ship(TOY, tmp_path / "empty", assets)
+    (tmp_path / "other").mkdir()
+    store.save_checkpoint(tmp_path / "other" / "x.safetensors", {}, {"study": "x", "method": "y"})
+    for folder, there in (("empty", "empty$"), ("other", "other, .* it holds x$")):
+        for call in (lambda f: ship(TOY, f, assets), lambda f: evaluate(TOY, checkpoints=f)):
+            with pytest.raises(store.CheckpointError, match=f"no checkpoint of toy in .*{there}"):
+                call(tmp_path / folder)
 
 
 def test_groups_of_seeds_put_together_are_the_whole(whole: Path, tmp_path: Path) -> None:
@@ -244,6 +259,8 @@ def test_groups_of_seeds_put_together_are_the_whole(whole: Path, tmp_path: Path)
     other = train(TOY, "walk", [7], length=60, out=tmp_path / "7")
     with pytest.raises(store.CheckpointError, match="other policies are kept"):
         merge([parts[0], other], tmp_path / "x")
+    with pytest.raises(store.CheckpointError, match="paths: wanted different seeds"):
+        merge([parts[0], parts[0]], tmp_path / "x")
 
 
 # -- sweeps ---------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import pandas as pd
 from cmc import results, store
 from cmc.learning.state import single_thread
 from cmc.studies.runner import Folder, Progress, find, load, marks_of
-from cmc.studies.study import Rows, Study, Test, checked_study
+from cmc.studies.study import Rows, Study, Test, checked_methods, checked_study
 from cmc.theory.arrays import count
 
 CURVE = 100
@@ -80,12 +80,10 @@ def _files(
     study: Study, names: Iterable[str] | None, checkpoints: Folder
 ) -> dict[str, Path | None]:
     """Checkpoint files of methods, None for fixed gains; without names, of all that have one."""
-    if isinstance(names, str) or not (names is None or isinstance(names, Iterable)):
-        raise ValueError(f"names: wanted a list of methods, got {names!r}")
     methods = checked_study(study).methods
     files = {
-        name: find(study, name, checkpoints) if study.method(name).trained else None
-        for name in (methods if names is None else names)
+        name: find(study, name, checkpoints) if methods[name].trained else None
+        for name in checked_methods("names", study, methods if names is None else names)
     }
     if names is None:
         files = {name: file for name, file in files.items() if file is None or file.is_file()}
@@ -101,18 +99,13 @@ def _files(
     return files
 
 
-def _marks(study: Study, name: str, file: Path | None) -> list[int]:
-    """Kept policies of a file; 0 for fixed gains, which have none."""
-    if file is None:
-        return [0]
-    return marks_of(store.load_checkpoint(file, study=study.name, method=name)[0])
-
-
 def _plan(
     study: Study, name: str, file: Path | None, trajectories: int | None
 ) -> list[tuple[Test, int]]:
-    """The tests of a method and the kept policies that they look at."""
-    largest, marks = max(test.number for test in study.tests), _marks(study, name, file)
+    """The tests of a method and the kept policies that they look at; 0 for fixed gains."""
+    largest, marks = max(test.number for test in study.tests), [0]
+    if file is not None:
+        marks = marks_of(store.load_checkpoint(file, study=study.name, method=name)[0])
     share = 1.0 if trajectories is None else count("trajectories", trajectories) / largest
     return [
         (replace(test, number=max(1, round(share * test.number))), mark)
@@ -125,12 +118,11 @@ def _plan(
 def _test(study: Study, name: str, test: Test, mark: int, file: Path | None) -> Tables:
     """Rows of one test of one kept policy, with what they are about in front."""
     found = load(study, name, mark if file else None, path=file)
-    marks = _marks(study, name, file)
     about: dict[str, Any] = {"method": name, "title": study.method(name).title}
-    about |= {"test": test.name, study.unit: mark, "last": mark == marks[-1]}
+    about |= {"test": test.name, study.unit: mark, "last": mark == found.marks[-1]}
     config = test.change(study.config_of(name))
     tables = study.judge(config, found.policy, len(found.seeds), test)
-    shown = set(tables) if mark in study.shown(marks) else {"tests", "certificates"}
+    shown = set(tables) if mark in study.shown(found.marks) else {"tests", "certificates"}
 
     def plain(row: dict[str, Any]) -> dict[str, Any]:
         """Plain numbers, without those that are missing; the seed in place of its position."""
@@ -158,6 +150,8 @@ def _curve(study: Study, name: str, file: Path) -> Rows:
 
 def summary(tables: Tables) -> list[str]:
     """A line for each method about its last policies in the nominal test: means over seeds."""
+    if not (isinstance(tables, dict) and tables.get("tests")):
+        raise ValueError("tables: wanted rows of `tests`, as `evaluate` answers")
     data = results.at(pd.DataFrame(tables["tests"]))
     shares, lines = ("success", "touched", "oscillation", "drift"), defaultdict(list)
     for key in (*shares, "error_f", "return", "largest_N"):
@@ -185,8 +179,7 @@ def ship(
     Returns:
         The files written.
     """
-    for name in complete:
-        checked_study(study).method(name)
+    complete = checked_methods("complete", study, complete)
     folder, target = store.as_path("folder", folder), store.as_path("assets", assets)
     files = _files(study, None, folder)
     options: Any = {"folder": folder / "results", "checkpoints": folder, "progress": progress}

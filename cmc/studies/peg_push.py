@@ -39,7 +39,6 @@ from dataclasses import replace
 from functools import cache
 
 import mujoco
-import numpy as np
 
 from cmc.envs.peg_push import PUSH, TARGET, PegPush
 from cmc.learning.hierarchy import HierarchyConfig
@@ -49,6 +48,7 @@ from cmc.studies.peg_maze import TESTS
 from cmc.studies.study import Study, Test, changed, last
 from cmc.studies.two_level import METHODS, TwoLevelConfig, light
 from cmc.studies.two_level_tests import judge, motion
+from cmc.theory.arrays import number
 
 TIME_CONSTANT = 0.01
 """Of contact in the scene, s."""
@@ -60,12 +60,10 @@ CONTACT = ("ctd3", "frozen", "td3")
 def scaled(scale: float) -> type[PegPush]:
     """Peg push with the time constant of all contact multiplied by `scale`.
 
-    Raises:
-        ValueError: if the time constant falls below two physics steps, the shortest that MuJoCo
-            accepts (it silently raises shorter ones).
+    MuJoCo silently raises time constants below two physics steps: they are refused.
     """
     shortest = 2 * PUSH.timestep
-    if not (np.isfinite(scale) and scale * TIME_CONSTANT >= shortest * (1 - 1e-9)):
+    if number("scale", scale) * TIME_CONSTANT < shortest * (1 - 1e-9):
         raise ValueError(
             f"scale: {scale} makes the time constant {1e3 * scale * TIME_CONSTANT:g} ms, wanted at "
             f"least two physics steps, {1e3 * shortest:g} ms"

@@ -16,6 +16,7 @@ from cmc.envs.peg_touch_config import PegShift, PegTouchConfig
 from cmc.plants import Lags
 from cmc.policies import ConvexGradientNetwork, ModularPolicy
 from cmc.studies.study import Array, Rows, Test, same
+from cmc.theory.arrays import checked, number
 from cmc.theory.certify import certify
 from cmc.theory.sampled import sampled_margin
 
@@ -146,13 +147,13 @@ def detect(error: ArrayLike, h: float) -> dict[str, Flags]:
     window, of another shape, or not finite.
     """
     e = np.asarray(error)
-    e = e if e.dtype == np.float32 else e.astype(np.float64)
-    if e.ndim != 3 or e.shape[-1] != len(THRESHOLD):
+    e = e if e.dtype == np.float32 else checked("error", error)
+    if e.ndim != 3 or e.shape[-1] != len(THRESHOLD) or not e.size:
         raise ValueError(f"error: wanted (time, batch, {len(THRESHOLD)}), got {e.shape}")
-    count = round(WINDOW / h)
+    count = round(WINDOW / number("h", h, above=0))
     if count < 8 or len(e) < count:
         raise ValueError(
-            f"error: wanted at least 8 samples in a window of {WINDOW} s and a record no "
+            f"error, h: wanted at least 8 samples in a window of {WINDOW} s and a record no "
             f"shorter than it; got {len(e)} samples every {h} s"
         )
     tail, half = e[-count:], count // 2

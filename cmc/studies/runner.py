@@ -164,6 +164,7 @@ class Loaded(NamedTuple):
     policy: Any  # as the study's tests take it, with a leading axis of seeds
     mark: int  # its step or episode; 0 for fixed gains
     seeds: list[int]  # the trainings
+    marks: list[int]  # of all policies that are kept
 
 
 def load(
@@ -188,7 +189,7 @@ def load(
     if not study.method(name).trained:
         if path is not None:
             raise ValueError(f"path: {name!r} has fixed gains and no checkpoint, got {path}")
-        return Loaded(light.build(name, [0]).acting(), 0, [0])
+        return Loaded(light.build(name, [0]).acting(), 0, [0], [0])
     tensors, record = store.load_checkpoint(file, study=study.name, method=name)
     found, seeds = marks_of(tensors), record.get("seeds")
     if not (found and isinstance(seeds, list) and seeds):
@@ -212,7 +213,7 @@ def load(
             state[key] = torch.from_numpy(value)
         module.load_state_dict(state)
         module.eval()
-    return Loaded(training.acting(), mark, chosen)
+    return Loaded(training.acting(), mark, chosen, found)
 
 
 def marks_of(tensors: Mapping[str, Any]) -> list[int]:

@@ -145,6 +145,16 @@ def checked_study(study: Any) -> Study:
     return study
 
 
+def checked_methods(name: str, study: Study, methods: Any) -> list[str]:
+    """Names of a study's methods, or a ValueError."""
+    if isinstance(methods, str) or not isinstance(methods, Iterable):
+        raise ValueError(f"{name}: wanted a list of methods, got {methods!r}")
+    found = list(methods)
+    for method in found:
+        checked_study(study).method(method)
+    return found
+
+
 def checked_seeds(seeds: Any) -> list[int]:
     """Different integers from 0, at least one, or a ValueError."""
     try:

@@ -23,7 +23,7 @@ import numpy as np
 
 from cmc import store, studies
 from cmc.studies import runner
-from cmc.studies.study import checked_seeds
+from cmc.studies.study import checked_methods, checked_seeds
 from cmc.theory.arrays import count
 
 
@@ -46,10 +46,9 @@ def sweep(
     of a scheduler or in a cluster of `jobs` processes made for it. `length` and `out` are those of
     `runner.train`.
     """
-    if isinstance(names, str) or not isinstance(names, Sequence) or not names:
-        raise ValueError(f"names: wanted a list of methods, got {names!r}")
-    for name in names:
-        studies.get(study).method(name)
+    names = checked_methods("names", studies.get(study), names)
+    if not names:
+        raise ValueError("names: wanted at least one method, got none")
     seeds = checked_seeds(seeds)
     size = count("group", len(seeds) if group is None else group)
     if backend not in ("loky", "dask"):

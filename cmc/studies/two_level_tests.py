@@ -15,6 +15,7 @@ from cmc.policies import PositiveNetwork
 from cmc.robot.panda import FINGERTIP, JOINTS, inverse_kinematics
 from cmc.studies.study import Array, Rows, Test, same
 from cmc.studies.two_level import N, Policy, TwoLevelConfig
+from cmc.theory.arrays import count
 
 TEST_SEED = 900_000  # test worlds never share a stream with training
 PUSH = 2.0
@@ -45,6 +46,8 @@ def judge(config: TwoLevelConfig, policy: Policy, seeds: int, test: Test) -> dic
 
 def figures(found: Mapping[str, Array]) -> Rows:
     """Figures of each seed's test episodes from `KEPT` of every tick, (T, S, M); S seeds."""
+    if not isinstance(found, Mapping) or not set(KEPT) <= set(found):
+        raise ValueError(f"found: wanted arrays of {', '.join(KEPT)} by name")
     distance, deepest = found["distance"], found["penetration"].max(0)
     success, touched = found["success"][-1] > 0, (found["success"] > 0).any(0)
     columns: dict[str, Array] = {
@@ -85,13 +88,22 @@ def _gains(config: TwoLevelConfig, low: LowLevel, seeds: int, k: int) -> dict[st
     }
 
 
-def slope_at_rest(config: TwoLevelConfig, low: LowLevel, seeds: int, eps: float = 1e-4) -> Array:
+def _asked(config: TwoLevelConfig, low: LowLevel, seeds: int) -> None:
+    """The door for what a low level is tested with."""
+    for name, value, kind in (("config", config, TwoLevelConfig), ("low", low, LowLevel)):
+        if not isinstance(value, kind):
+            raise ValueError(f"{name}: wanted a {kind.__name__}, got {value!r}")
+    count("seeds", seeds)
+
+
+def slope_at_rest(config: TwoLevelConfig, low: LowLevel, seeds: int) -> Array:
     """Slope du/dy at rest of every dimension, (seeds, 6), by a central difference."""
+    _asked(config, low, seeds)
     if config.task.command == "joint":
         raise ValueError("slopes in y: wanted a low level of the tip, got one of the joints")
     if low.actor is None:
         return np.zeros((seeds, N))
-    seen, index = np.zeros((seeds, 2 * N, 4 * N + 1)), np.arange(N)
+    seen, index, eps = np.zeros((seeds, 2 * N, 4 * N + 1)), np.arange(N), 1e-4
     seen[:, index, index], seen[:, N + index, index] = eps, -eps
     u = low.act(seen, explore=False)
     return (u[:, index, index] - u[:, N + index, index]) / (2 * eps)
@@ -116,12 +128,13 @@ def consistency(
     summed variances of the displacement over starts; `push_mm`, the root mean square distance
     between the segment's ends with the push and without it.
     """
+    _asked(config, low, seeds)
     bounds: dict[str, Any] = {}  # none that would shorten a step near the edge
     for name in ("subgoal", "workspace"):
         size = len(getattr(config.task, f"{name}_low"))
         bounds |= {f"{name}_low": (-1.0,) * size, f"{name}_high": (1.0,) * size}
     free = replace(config, task=replace(config.task, scene="panda.xml", **bounds))
-    task, rng = free.make(seeds * starts), np.random.default_rng(TEST_SEED)
+    task, rng = free.make(seeds * count("starts", starts)), np.random.default_rng(TEST_SEED)
     task.seed([TEST_SEED + 1 + k for k in range(starts)] * seeds)
     task.reset()
     ends = np.array(config.task.subgoal_low), np.array(config.task.subgoal_high)
