@@ -93,14 +93,6 @@ def _list(chosen: argparse.Namespace) -> None:
     print("tables without a training: " + ", ".join(studies.TABLES))
 
 
-def _methods(study: Study, name: str | None) -> list[str]:
-    """The method that was asked for, or all that can be trained."""
-    if name is not None:
-        study.method(name)
-        return [name]
-    return [key for key, method in study.methods.items() if method.trained]
-
-
 def _train(chosen: argparse.Namespace) -> None:
     from cmc.studies.runner import train
     from cmc.studies.sweep import sweep
@@ -112,7 +104,8 @@ def _train(chosen: argparse.Namespace) -> None:
     if chosen.address and chosen.backend != "dask":
         raise ValueError("--address: only with --backend dask")
     length, seeds = getattr(chosen, f"{study.unit}s"), range(chosen.seeds)
-    methods = _methods(study, chosen.method)
+    methods = [key for key, method in study.methods.items() if method.trained]
+    methods = methods if chosen.method is None else [chosen.method]
     if chosen.jobs != 1 or chosen.group is not None or chosen.backend != "loky":
         options = {key: getattr(chosen, key) for key in ("jobs", "backend", "group", "address")}
         made = sweep(study.name, methods, seeds, length=length, out=chosen.out, **options)
@@ -161,16 +154,10 @@ def _evaluate(chosen: argparse.Namespace) -> None:
         print(results.write(folder, "tests", data, {"study": chosen.study, **record}))
         return
     study = studies.get(chosen.study)
-    names = None if chosen.method is None else _methods(study, chosen.method)
+    names = None if chosen.method is None else [chosen.method]
+    asked: Any = {"trajectories": chosen.trajectories, "checkpoints": chosen.checkpoints}
     with _bar(study.name, "test") as show:
-        tables = evaluate(
-            study,
-            names,
-            trajectories=chosen.trajectories,
-            folder=chosen.out,
-            checkpoints=chosen.checkpoints,
-            progress=show,
-        )
+        tables = evaluate(study, names, folder=chosen.out, progress=show, **asked)
     print("\n".join(summary(tables)))
     if chosen.json:
         print(json.dumps(tables, allow_nan=False))
@@ -206,10 +193,8 @@ def _play(chosen: argparse.Namespace) -> None:
     out = _out(chosen.out, *((".html", ".npz") if "model" in motion else (".png",)))
     about = f"{study.name}, {study.method(method).title}, seed {found.seeds[0]}"
     motion |= {"text": f"{about}: {motion['text']}"}
-    if out.suffix == ".png":
-        _picture(motion, out)
-    elif out.suffix == ".html":
-        _page(motion, out)
+    if out.suffix != ".npz":
+        (_page if out.suffix == ".html" else _picture)(motion, out)
     else:
         command = f"python -m cmc play {study.name} --method {method} --seed {chosen.seed}"
         command += f" --episode {chosen.episode} --out {out.name}"
@@ -264,16 +249,11 @@ def _page(motion: dict[str, Any], out: Path) -> None:
     from cmc.view.playback import Arrow, record
 
     force = np.linalg.norm(motion["force"], axis=-1)
-    recording = record(
-        motion["model"],
-        motion["qpos"],
-        motion["t"],
-        title=motion["text"],
-        trails=["tip"],
-        markers=motion["markers"],
-        arrows={"contact force": Arrow(motion["tip"], motion["force"])},
-        readouts={"distance [mm]": 1e3 * motion["distance"], "force [N]": force},
-    )
+    shown: dict[str, Any] = {"title": motion["text"], "trails": ["tip"]}
+    shown["markers"] = motion["markers"]
+    shown["arrows"] = {"contact force": Arrow(motion["tip"], motion["force"])}
+    shown["readouts"] = {"distance [mm]": 1e3 * motion["distance"], "force [N]": force}
+    recording = record(motion["model"], motion["qpos"], motion["t"], **shown)
     views = dict(recording.cameras)
     near = {"task": views.pop("task")} if "task" in views else {}
     replace(recording, cameras=near | views).save(out)

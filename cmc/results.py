@@ -80,11 +80,7 @@ RESAMPLES = 9999
 
 
 def tidy(study: str, table: str = "tests") -> pd.DataFrame:
-    """A table, one of `TABLES`, of shipped results; the module's docstring lists the columns.
-
-    Raises:
-        ValueError: if there is no such table of this study, or the file is damaged.
-    """
+    """A table, one of `TABLES`, of shipped results; the module's docstring lists the columns."""
     wanted = file_name(study, table)
     there = sorted(path.stem for path in store.asset("results").glob("*.csv"))
     if wanted.removesuffix(".csv") not in there:
@@ -129,11 +125,8 @@ def at(
 ) -> pd.DataFrame:
     """Rows of one test and one kept policy of each method: a row for each method and seed.
 
-    Args:
-        data: what `tidy` answers.
-        when: step or episode of the policy; the last one if None. Fixed gains are always there.
-        test: the test.
-        h: control period of the test, s, where there are several.
+    `when` is step or episode of the policy, the last one if None; fixed gains are always there. `h`
+    is the control period of the test, s, where there are several. A ValueError names what there is.
     """
     time = "step" if "step" in _table(data, "last", "test") else "episode"
     several = "h" in data and data["h"].nunique() > 1
@@ -161,17 +154,10 @@ def _table(data: Any, *columns: Any) -> pd.DataFrame:
 def spread(data: pd.DataFrame, key: str, by: str | Sequence[str] = "method") -> pd.DataFrame:
     """Mean over seeds of a figure, its 95 % bootstrap interval, smallest and largest seed.
 
-    Args:
-        data: one row for each seed in each group.
-        key: the figure's column.
-        by: columns that make the groups.
-
-    Returns:
-        By group `mean`, `low`, `high` (percentile bootstrap over seeds; NaN for one seed), `least`,
-        `largest` and `seeds`, their number. Groups without the figure are left out.
-
-    Raises:
-        ValueError: if a seed has several rows in a group.
+    `data` has one row for each seed in each group, else a ValueError says so; `key` is the figure's
+    column, and `by` the columns that make the groups. Answers by group `mean`, `low`, `high`
+    (percentile bootstrap over seeds; NaN for one seed), `least`, `largest` and `seeds`, their
+    number. Groups without the figure are left out.
     """
     keys = [by] if isinstance(by, str) or not isinstance(by, Sequence) else [*by]
     data = _figures(data, key, *(keys or [by]), "seed")
@@ -211,13 +197,9 @@ def share(
 def against(data: pd.DataFrame, arm: str, other: str, key: str = "success") -> pd.Series:
     """One method's mean over seeds of a figure, minus another's; `data` has a row for each seed.
 
-    Returns:
-        `difference`, `low`, `high` (95 %, percentile bootstrap over both methods' seeds) and `p`,
-        exact and two-sided: the share of all ways to deal the seeds to two methods that differ as
-        much.
-
-    Raises:
-        ValueError: if a method is missing, or one of its seeds has several rows.
+    Answers `difference`, `low`, `high` (95 %, percentile bootstrap over both methods' seeds) and
+    `p`, exact and two-sided: the share of all ways to deal the seeds to two methods that differ as
+    much. A ValueError says if a method is missing, or one of its seeds has several rows.
     """
     pair = []
     for name in (arm, other):
@@ -238,8 +220,7 @@ def against(data: pd.DataFrame, arm: str, other: str, key: str = "success") -> p
 def compare(data: pd.DataFrame, comparisons: Iterable[tuple[str, str, str]]) -> pd.DataFrame:
     """`against` for comparisons (arm, other, key) that were named before looking.
 
-    Returns:
-        A row for each, with `p_holm`: p-values corrected by Holm for all that are in the list.
+    A row for each, with `p_holm`: p-values corrected by Holm for all that are in the list.
     """
     try:
         named = [(arm, other, key) for arm, other, key in comparisons]

@@ -38,9 +38,7 @@ from cmc.theory.exact import Region
 from cmc.theory.slopes import action_of
 
 PEG = "cmc.envs:cmc/PegTouch-v0"
-
-UPDATES = 40
-CONFIG = PPOConfig(critic_hidden=(32, 32))
+UPDATES, CONFIG = 40, PPOConfig(critic_hidden=(32, 32))
 KWARGS = {"log_std_init": CONFIG.log_std_start, "net_arch": {"pi": [16, 16], "vf": [32, 32]}}
 ALIKE = {"n_steps": 50, "batch_size": 200, "n_epochs": 4, "learning_rate": CONFIG.learning_rate}
 

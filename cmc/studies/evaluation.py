@@ -36,13 +36,10 @@ def evaluate(
 ) -> Tables:
     """Test trained policies; rows by table, as `cmc.results` describes them.
 
-    Args:
-        study: whose policies.
-        names: methods; all that have a checkpoint or need none if None.
-        trajectories: of each seed in the largest tests, others in proportion; the study's if None.
-        folder: where finished tests are kept and not repeated; by default `runs/STUDY/results`.
-        checkpoints: folder of checkpoint files; the shipped ones if None.
-        progress: called with (tests done, tests in all, what is next).
+    Without `names` all methods are tested that have a checkpoint, in the folder `checkpoints` or
+    shipped, or need none. `trajectories` are those of each seed in the largest tests, others in
+    proportion. Finished tests are kept in `folder` (`runs/STUDY/results`) and not repeated.
+    `progress` is called with (tests done, tests in all, what is next).
 
     Raises:
         CheckpointError: if a file is missing, damaged or of another study, or there is none at all.
@@ -174,10 +171,8 @@ def ship(
 
     The last policy of each method goes to `assets/checkpoints`, bit by bit, with the run's record
     beside it as JSON; of methods in `complete` all kept policies go. Their rows replace those of
-    the same method in `assets/results`. Finished tests are kept in `FOLDER/results`.
-
-    Returns:
-        The files written.
+    the same method in `assets/results`. Finished tests are kept in `FOLDER/results`. Returns the
+    files written.
     """
     complete = checked_methods("complete", study, complete)
     folder, target = store.as_path("folder", folder), store.as_path("assets", assets)

@@ -44,7 +44,6 @@ _CENTER = (0.415, -0.0225, 0.005)
 _INVERSE_HALF = (1 / 0.015, 1 / 0.0075, 1 / 0.01)
 
 TESTS = (Test("nominal", 20, when=before_last), Test("nominal", 100, when=last))
-"""Policies kept on the way are tested by fewer episodes."""
 
 STUDY = Study(
     name="peg_maze",

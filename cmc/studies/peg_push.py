@@ -22,15 +22,12 @@ What the paper gives is in `cmc.envs.peg_push` and in the table `tab:para`. Devi
    are in the table `peg_push_seeds_5_9`.
 
 The contact of the simulator is soft; how much of the result it owes to that is tested too. MuJoCo
-(its documentation, chapter Modeling, section "Solver parameters") resolves a contact of depth r by
-the reference acceleration a = -b v - k r with
+(documentation, "Solver parameters") resolves a contact of depth r by a = -b v - k r with
 
-    b = 2 / (d_max T),    k = d(r) / (d_max^2 T^2 zeta^2),
+    b = 2 / (d_max T),    k = d(r) / (d_max^2 T^2 zeta^2),    solref = (T, zeta).
 
-where solref = (T, zeta) are a time constant and a damping ratio, and solimp sets the impedance d.
 Appendix H has T = 10 ms and zeta = 1. Tests "contact x c" multiply T of every shape that can touch
-by c, while zeta, d and all else stay: k goes with 1 / c^2, b with 1 / c. Studies
-`peg_push_contact_xC` train under such contact.
+by c: k goes with 1 / c^2, b with 1 / c. Studies `peg_push_contact_xC` train under such contact.
 """
 
 from __future__ import annotations

@@ -49,8 +49,7 @@ from cmc.studies.study import Array, Change, Method, Study, Test, both, changed,
 from cmc.theory.sampled import largest_slope
 
 HIDDEN = (32, 32)
-SAFETY = 0.98
-"""Share of the sampled-data limit that a cap leaves to the policy: our choice."""
+SAFETY = 0.98  # share of the sampled-data limit that a cap leaves to the policy: our choice
 
 
 @dataclass(frozen=True)
@@ -161,8 +160,7 @@ STRESS = changed(ppo={"learning_rate": 3e-3, "epochs": 10, "log_std_floor": -20.
 """PPO set aggressively: large steps, more epochs, no floor under the noise."""
 QUIET, LOUD = changed(noise=(-1.0, -3.0)), changed(noise=(-1.0, -1.0))
 """Little noise vertically, and as much as horizontally."""
-BYPASS = [[0.0, 0.0], [0.15, 0.6]]
-"""Shares of the limit in a linear bypass, vertically; horizontally no cap binds. Our choice."""
+BYPASS = [[0.0, 0.0], [0.15, 0.6]]  # shares of the limit, vertically; our choice
 FREE, CPPO, CAPPED = modular(IndependentNetwork), positive(), positive(capped=True)
 PI, PI_SCALED = fixed((2.0, 40.0), (0.02, 8.0)), fixed((2.0, 40.0), (0.012, 5.6))
 

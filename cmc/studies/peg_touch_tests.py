@@ -283,8 +283,7 @@ def certificates(policy: nn.Module, task: PegTouchConfig, limit: Array) -> Rows:
 def motion(config: Any, policy: nn.Module, episode: int) -> dict[str, Any]:
     """Errors of 50 trajectories of the training set for 1 s, from a random stream of this number.
 
-    Returns:
-        `t` (time,), `signals` (label, errors by time and trajectory, target), and `text`.
+    `t` (time,), `signals` (label, errors by time and trajectory, target), and `text`.
     """
     envs, errors = PegTouchVectorEnv(50, config.task, AutoresetMode.DISABLED), []
     obs, _ = envs.reset(seed=episode)

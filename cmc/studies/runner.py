@@ -45,17 +45,10 @@ def train(
 ) -> Path:
     """Train a method and keep its policies; a run that was stopped goes on where it was.
 
-    Args:
-        study: what is trained.
-        name: one of its methods.
-        seeds: one training for each, all in one batch of networks.
-        length: steps or episodes of each seed, in place of the study's.
-        out: folder of the run, by default `runs/STUDY`.
-        callback: called after every segment with `done`, `total`, `gain` (seeds,) and, where the
-            training knows it, `success` (seeds,), the share of the latest finished episodes.
-
-    Returns:
-        The checkpoint file with all kept policies, which `load` reads.
+    All seeds are trained in one batch of networks, for `length` steps or episodes each (the study's
+    if None), in the folder `out` (`runs/STUDY`). `callback` is called after every segment with
+    `done`, `total`, `gain` (seeds,) and, where the training knows it, `success` (seeds,), the share
+    of the latest finished episodes. Returns the file with all kept policies, which `load` reads.
 
     Raises:
         CheckpointError: if the folder holds a run of other seeds or another configuration.
@@ -177,12 +170,9 @@ def load(
 ) -> Loaded:
     """A trained policy; fixed gains need no file.
 
-    Args:
-        study: of the policy.
-        name: method.
-        mark: step or episode of a kept policy; the last one if None.
-        seed: position of one seed, for a leading axis of one; None for all seeds.
-        path: checkpoint file; the shipped one if None.
+    `mark` is the step or episode of a kept policy (the last one if None), `seed` the position of
+    one seed, for a leading axis of one (all seeds if None), `path` a checkpoint file in place of
+    the shipped one.
     """
     file = find(study, name) if path is None else store.as_path("path", path)
     light = replace(study, config=study.light(study.config))

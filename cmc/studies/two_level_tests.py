@@ -194,10 +194,9 @@ def _segment(
 def motion(config: TwoLevelConfig, policy: Policy, episode: int) -> dict[str, Any]:
     """One test episode of one seed, recorded.
 
-    Returns:
-        `model` (MuJoCo), `t` (T + 1,), `qpos` (T + 1, nq), `tip` (T + 1, 3), `force` (T + 1, 3),
-        N, on the peg, `distance` (T + 1,) to the goal, m, `markers` (name to (3,) or (T + 1, 3)),
-        `success` at the end and `touched` at any tick, and `text`.
+    `model` (MuJoCo), `t` (T + 1,), `qpos` (T + 1, nq), `tip` (T + 1, 3), `force` (T + 1, 3), N, on
+    the peg, `distance` (T + 1,) to the goal, m, `markers` (name to (3,) or (T + 1, 3)), `success` and
+    `touched` (at the end, at any tick), and `text`.
     """
     task, start = config.make(1), config.make(1)
     for each in (task, start):
