@@ -159,7 +159,7 @@ def spread(data: pd.DataFrame, key: str, by: str | Sequence[str] = "method") -> 
     (percentile bootstrap over seeds; NaN for one seed), `least`, `largest` and `seeds`, their
     number. Groups without the figure are left out.
     """
-    keys = [by] if isinstance(by, str) or not isinstance(by, Sequence) else [*by]
+    keys: list[Any] = [*by] if isinstance(by, list | tuple) else [by]
     data = _figures(data, key, *(keys or [by]), "seed")
     if data.duplicated([*keys, "seed"]).any():
         raise ValueError(

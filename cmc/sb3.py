@@ -206,7 +206,8 @@ def _check_spaces(seen: Any, action: Any, options: dict[str, Any]) -> None:
     """Refuse spaces that hold no (n, 2) signals for n actions, or options that do not fit."""
     if not isinstance(action, spaces.Box) or len(action.shape) != 1:
         raise ValueError(f"wanted actions in a Box of one axis; got {action}")
-    layout, n, shape = options.get("layout"), action.shape[0], getattr(seen, "shape", None) or ()
+    layout, n = options.get("layout"), action.shape[0]
+    shape: tuple[int, ...] = getattr(seen, "shape", None) or ()
     if not isinstance(seen, spaces.Box) or (layout is None and shape != (2 * n,)):
         raise ValueError(
             f"wanted observations of shape ({2 * n},), (z_i, integral of z_i) for each of "

@@ -147,8 +147,8 @@ class OffPolicyCorrection(Kept):
         units = low.units
         self.n = len(units.start)
         self.size = (3 * horizon + 1) * self.n
-        low, high = ((end - units.start) / units.half for end in (units.low, units.high))
-        self._reach = (tensor(low), tensor(high))
+        ends = [(end - units.start) / units.half for end in (units.low, units.high)]
+        self._reach = (tensor(ends[0]), tensor(ends[1]))
         self.streams = [np.random.default_rng([seed, 4, 17]) for seed in seeds]
 
     def pack(self, segment: Segment) -> Array:

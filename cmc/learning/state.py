@@ -136,8 +136,8 @@ def under(arrays: Mapping[str, np.ndarray], start: str) -> Arrays:
 
 def plain(value: Any) -> Any:
     """What JSON makes of a value: tuples and arrays become lists, and classes their names."""
-    names = {"default": lambda x: x.tolist() if hasattr(x, "tolist") else x.__name__}
-    return json.loads(json.dumps(value, **names))
+    text = json.dumps(value, default=lambda x: x.tolist() if hasattr(x, "tolist") else x.__name__)
+    return json.loads(text)
 
 
 @contextmanager

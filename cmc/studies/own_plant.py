@@ -155,7 +155,8 @@ def table(updates: int = UPDATES) -> pd.DataFrame:
     rows = []
     for name, (title, learner, build) in METHODS.items():
         begin, policy = time.process_time(), build()
-        seeds, steps = (0,), 0
+        seeds: tuple[int, ...] = (0,)
+        steps = 0
         if learner is not None:
             env = PlantVectorEnv(EACH * len(SEEDS), PLANT, H, target=GOAL, horizon=STEPS, room=1.6)
             seen = AuxiliarySpaceVectorWrapper(env, SPACE)

@@ -195,8 +195,8 @@ def motion(config: TwoLevelConfig, policy: Policy, episode: int) -> dict[str, An
     """One test episode of one seed, recorded.
 
     `model` (MuJoCo), `t` (T + 1,), `qpos` (T + 1, nq), `tip` (T + 1, 3), `force` (T + 1, 3), N, on
-    the peg, `distance` (T + 1,) to the goal, m, `markers` (name to (3,) or (T + 1, 3)), `success` and
-    `touched` (at the end, at any tick), and `text`.
+    the peg, `distance` (T + 1,) to the goal, m, `markers` (name to (3,) or (T + 1, 3)),
+    `success` and `touched` (at the end, at any tick), and `text`.
     """
     task, start = config.make(1), config.make(1)
     for each in (task, start):
