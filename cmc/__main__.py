@@ -6,6 +6,7 @@ This is the only place where learning and pictures meet.
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import json
 import sys
@@ -22,15 +23,16 @@ from cmc.studies.study import Study
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status (2 for a request that cannot be met)."""
-    parser = _parser()
+    parser, rest = _parser(), "the same command goes on from what was saved last"
     chosen = parser.parse_args(arguments)
     try:
         chosen.run(chosen)
     except (ValueError, OSError) as error:
-        print(f"{parser.prog} {chosen.command}: {error}", file=sys.stderr)
+        full = isinstance(error, OSError) and error.errno == errno.ENOSPC
+        more = f"; make room, and {rest}" if full else ""
+        print(f"{parser.prog} {chosen.command}: {error}{more}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as reason:
-        rest = "the same command goes on from what was saved last"
         said = f"{reason}; {rest}" if str(reason) else rest
         print(f"{parser.prog} {chosen.command}: interrupted; {said}")
         return 130

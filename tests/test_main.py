@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 import signal
 import subprocess
@@ -97,6 +99,19 @@ def test_wrong_requests_are_one_sentence_each(request_, message, tmp_path, capsy
     said = capsys.readouterr().err.splitlines()[-1]
     assert message in said
     assert said.startswith("python -m cmc ")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_says_how_to_go_on(tmp_path: Path, capsys, monkeypatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert main([*CPPO, "--episodes", "16", "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert (
+        f"No space left on device: '{tmp_path / 'peg_touch_cppo.safetensors'}'; make room" in said
+    )
     assert not list(tmp_path.iterdir())
 
 
