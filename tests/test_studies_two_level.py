@@ -144,10 +144,12 @@ def test_only_the_time_constant_of_what_touches_changes(scale: float) -> None:
     np.testing.assert_array_equal(*buffers)
 
 
-@pytest.mark.parametrize("scale", [0.39, 0.0, -1.0, np.nan])
-def test_a_time_constant_that_the_engine_would_raise_is_refused(scale: float) -> None:
-    with pytest.raises(ValueError, match="two physics steps, 4 ms"):
-        scaled(scale)
+def test_a_time_constant_that_the_engine_would_raise_is_refused() -> None:
+    for scale in (0.39, 0.0, -1.0):
+        with pytest.raises(ValueError, match="two physics steps, 4 ms"):
+            scaled(scale)
+    with pytest.raises(ValueError, match="scale needs finite"):
+        scaled(np.nan)
 
 
 # -- figures -----------------------------------------------------------------------------------
