@@ -180,7 +180,7 @@ def _play(chosen: argparse.Namespace) -> None:
     from cmc.studies.runner import load
 
     study = studies.get(chosen.study)
-    method = chosen.method or next(iter(study.methods))
+    method = next(iter(study.methods)) if chosen.method is None else chosen.method
     if chosen.live or chosen.beside is not None:
         _refuse(
             chosen, ("checkpoint", "episode"), "not with a live page, which has shipped policies"

@@ -7,6 +7,7 @@ is written to a temporary name, flushed, and renamed.
 
 from __future__ import annotations
 
+import errno
 import glob
 import hashlib
 import json
@@ -54,7 +55,11 @@ def write_atomic(path: str | Path, write: Callable[[IO[bytes]], Any]) -> Path:
     one is removed; what a killed process left is removed by the next one that writes the file.
     """
     path = as_path("path", path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        code = errno.ENOTDIR
+        raise NotADirectoryError(code, os.strerror(code), str(path.parent)) from error
     own = f".{path.name}.{_HOST}-"
     for left in path.parent.glob(f"{glob.escape(own)}*.tmp"):
         pid = left.name.removeprefix(own).split("-")[0]

@@ -78,6 +78,7 @@ def _files(
 ) -> dict[str, Path | None]:
     """Checkpoint files of methods, None for fixed gains; without names, of all that have one."""
     methods = checked_study(study).methods
+    checkpoints = None if checkpoints is None else store.as_path("checkpoints", checkpoints)
     files = {
         name: find(study, name, checkpoints) if methods[name].trained else None
         for name in checked_methods("names", study, methods if names is None else names)
@@ -87,7 +88,7 @@ def _files(
         if not any(files.values()) and any(method.trained for method in methods.values()):
             where = f"is shipped: `python -m cmc train {study.name}` makes them"
             if checkpoints is not None:
-                others = sorted(path.stem for path in Path(checkpoints).glob("*.safetensors"))
+                others = sorted(path.stem for path in checkpoints.glob("*.safetensors"))
                 where = f"in {checkpoints}, wanted its folder; it holds {', '.join(others[:3])}"
                 where = where if others else f"in {checkpoints}"
             raise store.CheckpointError(f"no checkpoint of {study.name} {where}")

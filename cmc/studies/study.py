@@ -50,7 +50,7 @@ def changed(**changes: Any) -> Change:
     def adapt(config: Any) -> Any:
         new: dict[str, Any] = {}
         for name, value in changes.items():
-            old: Any = getattr(config, name)
+            old: Any = getattr(config, name, None)  # `replace` refuses a field that is not there
             partial = is_dataclass(old) and isinstance(value, Mapping)
             new[name] = replace(old, **value) if partial else value
         return replace(config, **new)
