@@ -7,26 +7,12 @@ so the theory needs no torch and the robot no plotting.
 from __future__ import annotations
 
 import importlib
+import pkgutil
 from typing import Any
 
 __version__ = "0.1.0"
 
-_SUBMODULES = (
-    "envs",
-    "exercises",
-    "fast",
-    "learning",
-    "notation",
-    "plants",
-    "policies",
-    "results",
-    "robot",
-    "sb3",
-    "store",
-    "studies",
-    "theory",
-    "view",
-)
+_SUBMODULES = tuple(part.name for part in pkgutil.iter_modules(__path__) if part.name[0] != "_")
 
 __all__ = ["__version__", *_SUBMODULES]
 

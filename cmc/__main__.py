@@ -6,6 +6,7 @@ This is the only place where learning and pictures meet.
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import json
 import sys
@@ -22,15 +23,16 @@ from cmc.studies.study import Study
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit status (2 for a request that cannot be met)."""
-    parser = _parser()
+    parser, rest = _parser(), "the same command goes on from what was saved last"
     chosen = parser.parse_args(arguments)
     try:
         chosen.run(chosen)
     except (ValueError, OSError) as error:
-        print(f"{parser.prog} {chosen.command}: {error}", file=sys.stderr)
+        full = isinstance(error, OSError) and error.errno == errno.ENOSPC
+        more = f"; make room, and {rest}" if full else ""
+        print(f"{parser.prog} {chosen.command}: {error}{more}", file=sys.stderr)
         return 2
     except KeyboardInterrupt as reason:
-        rest = "the same command goes on from what was saved last"
         said = f"{reason}; {rest}" if str(reason) else rest
         print(f"{parser.prog} {chosen.command}: interrupted; {said}")
         return 130
@@ -93,14 +95,6 @@ def _list(chosen: argparse.Namespace) -> None:
     print("tables without a training: " + ", ".join(studies.TABLES))
 
 
-def _methods(study: Study, name: str | None) -> list[str]:
-    """The method that was asked for, or all that can be trained."""
-    if name is not None:
-        study.method(name)
-        return [name]
-    return [key for key, method in study.methods.items() if method.trained]
-
-
 def _train(chosen: argparse.Namespace) -> None:
     from cmc.studies.runner import train
     from cmc.studies.sweep import sweep
@@ -112,7 +106,8 @@ def _train(chosen: argparse.Namespace) -> None:
     if chosen.address and chosen.backend != "dask":
         raise ValueError("--address: only with --backend dask")
     length, seeds = getattr(chosen, f"{study.unit}s"), range(chosen.seeds)
-    methods = _methods(study, chosen.method)
+    methods = [key for key, method in study.methods.items() if method.trained]
+    methods = methods if chosen.method is None else [chosen.method]
     if chosen.jobs != 1 or chosen.group is not None or chosen.backend != "loky":
         options = {key: getattr(chosen, key) for key in ("jobs", "backend", "group", "address")}
         made = sweep(study.name, methods, seeds, length=length, out=chosen.out, **options)
@@ -152,6 +147,7 @@ def _evaluate(chosen: argparse.Namespace) -> None:
     from cmc.studies.evaluation import evaluate, summary
 
     if chosen.study in studies.TABLES:
+        _refuse(chosen, ("method", "trajectories", "checkpoints", "json"), "not for a table")
         data = importlib.import_module(f"cmc.studies.{chosen.study}").table()
         seeds = sorted({int(seed) for seed in data["seed"]})
         record = store.provenance(f"python -m cmc evaluate {chosen.study}", seeds)
@@ -160,16 +156,10 @@ def _evaluate(chosen: argparse.Namespace) -> None:
         print(results.write(folder, "tests", data, {"study": chosen.study, **record}))
         return
     study = studies.get(chosen.study)
-    names = None if chosen.method is None else _methods(study, chosen.method)
+    names = None if chosen.method is None else [chosen.method]
+    asked: Any = {"trajectories": chosen.trajectories, "checkpoints": chosen.checkpoints}
     with _bar(study.name, "test") as show:
-        tables = evaluate(
-            study,
-            names,
-            trajectories=chosen.trajectories,
-            folder=chosen.out,
-            checkpoints=chosen.checkpoints,
-            progress=show,
-        )
+        tables = evaluate(study, names, folder=chosen.out, progress=show, **asked)
     print("\n".join(summary(tables)))
     if chosen.json:
         print(json.dumps(tables, allow_nan=False))
@@ -190,8 +180,11 @@ def _play(chosen: argparse.Namespace) -> None:
     from cmc.studies.runner import load
 
     study = studies.get(chosen.study)
-    method = chosen.method or next(iter(study.methods))
-    if chosen.live or chosen.beside:
+    method = next(iter(study.methods)) if chosen.method is None else chosen.method
+    if chosen.live or chosen.beside is not None:
+        _refuse(
+            chosen, ("checkpoint", "episode"), "not with a live page, which has shipped policies"
+        )
         _live(study, method, chosen)
         return
     if chosen.episode < 0:
@@ -199,22 +192,32 @@ def _play(chosen: argparse.Namespace) -> None:
     seed = chosen.seed if study.method(method).trained else None
     found = load(study, method, seed=seed, path=chosen.checkpoint)
     motion = study.motion(study.config_of(method), found.policy, chosen.episode)
-    wanted = (".html", ".npz") if "model" in motion else (".png",)
-    out = chosen.out or Path(f"play{wanted[0]}")
-    if out.suffix not in wanted:
-        raise ValueError(f"--out: wanted a {' or '.join(wanted)} file, got {out}")
+    out = _out(chosen.out, *((".html", ".npz") if "model" in motion else (".png",)))
     about = f"{study.name}, {study.method(method).title}, seed {found.seeds[0]}"
     motion |= {"text": f"{about}: {motion['text']}"}
-    if out.suffix == ".png":
-        _picture(motion, out)
-    elif out.suffix == ".html":
-        _page(motion, out)
+    if out.suffix != ".npz":
+        (_page if out.suffix == ".html" else _picture)(motion, out)
     else:
         command = f"python -m cmc play {study.name} --method {method} --seed {chosen.seed}"
         command += f" --episode {chosen.episode} --out {out.name}"
         record = {"study": study.name, "method": method}
         recorded.save(out, motion, record | store.provenance(command, found.seeds))
     print(f"{motion['text']}\n{out}")
+
+
+def _refuse(chosen: argparse.Namespace, names: Sequence[str], why: str) -> None:
+    """Raise where an option was given that would not count."""
+    for name in names:
+        if getattr(chosen, name):
+            raise ValueError(f"--{name}: {why}")
+
+
+def _out(path: Path | None, *kinds: str) -> Path:
+    """The file that was asked for, or `play` of the first kind."""
+    path = path or Path(f"play{kinds[0]}")
+    if path.suffix not in kinds:
+        raise ValueError(f"--out: wanted a {' or '.join(kinds)} file, got {path}")
+    return path
 
 
 def _live(study: Study, method: str, chosen: argparse.Namespace) -> None:
@@ -225,7 +228,7 @@ def _live(study: Study, method: str, chosen: argparse.Namespace) -> None:
     first = [method] if chosen.beside is None else [method, chosen.beside]
     policies = live.live_policies(study, live.playable(study, first))
     title = f"{study.name}: " + " beside ".join(study.method(name).title for name in first)
-    task, out = live.live_task(study), chosen.out or Path("live.html")
+    task, out = live.live_task(study), _out(chosen.out or Path("live.html"), ".html")
     page = live_page(task, policies, title=title, arms=len(first), seed=chosen.seed).encode()
     store.write_atomic(out, lambda file: file.write(page))
     print(f"{title}\n{out}")
@@ -248,16 +251,11 @@ def _page(motion: dict[str, Any], out: Path) -> None:
     from cmc.view.playback import Arrow, record
 
     force = np.linalg.norm(motion["force"], axis=-1)
-    recording = record(
-        motion["model"],
-        motion["qpos"],
-        motion["t"],
-        title=motion["text"],
-        trails=["tip"],
-        markers=motion["markers"],
-        arrows={"contact force": Arrow(motion["tip"], motion["force"])},
-        readouts={"distance [mm]": 1e3 * motion["distance"], "force [N]": force},
-    )
+    shown: dict[str, Any] = {"title": motion["text"], "trails": ["tip"]}
+    shown["markers"] = motion["markers"]
+    shown["arrows"] = {"contact force": Arrow(motion["tip"], motion["force"])}
+    shown["readouts"] = {"distance [mm]": 1e3 * motion["distance"], "force [N]": force}
+    recording = record(motion["model"], motion["qpos"], motion["t"], **shown)
     views = dict(recording.cameras)
     near = {"task": views.pop("task")} if "task" in views else {}
     replace(recording, cameras=near | views).save(out)

@@ -64,6 +64,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from cmc import store
+from cmc.theory.arrays import checked
 
 TABLES = {
     "tests": "a row for each method, test, kept policy and seed",
@@ -79,13 +80,7 @@ RESAMPLES = 9999
 
 
 def tidy(study: str, table: str = "tests") -> pd.DataFrame:
-    """A table, one of `TABLES`, of shipped results; the module's docstring lists the columns.
-
-    Raises:
-        ValueError: if there is no such table of this study, or the file is damaged.
-    """
-    if table not in TABLES:
-        raise ValueError(f"table: wanted one of {', '.join(TABLES)}, got {table!r}")
+    """A table, one of `TABLES`, of shipped results; the module's docstring lists the columns."""
     wanted = file_name(study, table)
     there = sorted(path.stem for path in store.asset("results").glob("*.csv"))
     if wanted.removesuffix(".csv") not in there:
@@ -95,31 +90,33 @@ def tidy(study: str, table: str = "tests") -> pd.DataFrame:
 
 def file_name(study: str, table: str) -> str:
     """Name of a table's file."""
+    if not isinstance(study, str):
+        raise ValueError(f"study: wanted a name, got {study!r}")
+    if not isinstance(table, str) or table not in TABLES:
+        raise ValueError(f"table: wanted one of {', '.join(TABLES)}, got {table!r}")
     return f"{study}.csv" if table == "tests" else f"{study}_{table}.csv"
 
 
 def read(path: str | Path) -> pd.DataFrame:
-    """A table and its record (`attrs`) from a file that `write` made.
-
-    Raises:
-        ValueError: if the first line is no record.
-    """
-    with Path(path).open(encoding="utf-8") as file:
-        first = file.readline()
+    """A table and its record (`attrs`) from a file that `write` made; a ValueError for others."""
+    with store.as_path("path", path).open(encoding="utf-8") as file:
         try:
-            record = json.loads(first.removeprefix("#"))
-        except json.JSONDecodeError as error:
-            raise ValueError(f"{path}: wanted a record in the first line, got {first!r}") from error
-        data = pd.read_csv(file)
+            record = json.loads(file.readline().removeprefix("#"))
+            data = pd.read_csv(file)
+        except ValueError as error:  # of JSON, of the text's code, of pandas
+            said = f"{path}: wanted a record in the first line and a table below it"
+            raise ValueError(f"{said} ({error})") from error
+    if not isinstance(record, dict) or not isinstance(data.index, pd.RangeIndex):
+        raise ValueError(f"{path}: wanted a record in the first line, and rows as long as the head")
     data.attrs = record
     return data
 
 
 def write(folder: str | Path, table: str, data: pd.DataFrame, record: Mapping[str, Any]) -> Path:
     """Write a table of `record["study"]`: CSV, six digits, below a line with the record."""
-    text = data.to_csv(index=False, float_format="%.6g", lineterminator="\n")
-    head = json.dumps(dict(record), allow_nan=False)
-    path = Path(folder) / file_name(record["study"], table)
+    head = store.as_json("record", record, "study")
+    path = store.as_path("folder", folder) / file_name(record["study"], table)
+    text = _table(data).to_csv(index=False, float_format="%.6g", lineterminator="\n")
     return store.write_atomic(path, lambda file: file.write(f"# {head}\n{text}".encode()))
 
 
@@ -128,35 +125,42 @@ def at(
 ) -> pd.DataFrame:
     """Rows of one test and one kept policy of each method: a row for each method and seed.
 
-    Args:
-        data: what `tidy` answers.
-        when: step or episode of the policy; the last one if None. Fixed gains are always there.
-        test: the test.
-        h: control period of the test, s, where there are several.
+    `when` is step or episode of the policy, the last one if None; fixed gains are always there. `h`
+    is the control period of the test, s, where there are several. A ValueError names what there is.
     """
-    time = "step" if "step" in data else "episode"
+    time = "step" if "step" in _table(data, "last", "test") else "episode"
+    several = "h" in data and data["h"].nunique() > 1
+    asked = {"test": test} | ({"h": h} if several else {}) | ({} if when is None else {time: when})
+    for key, value in asked.items():
+        there = data[key].dropna().unique().tolist()
+        if value not in there:
+            name = "when" if key == time else key
+            raise ValueError(f"{name}: wanted one of {there}, got {value!r}")
     chosen = data[time].isin([when, 0]) if when is not None else data["last"]
-    chosen &= data["test"] == test
-    return data[chosen & (data["h"] == h)] if "h" in data else data[chosen]
+    chosen = chosen & (data["test"] == test)
+    return data[chosen & (data["h"] == h)] if several else data[chosen]
+
+
+def _table(data: Any, *columns: Any) -> pd.DataFrame:
+    """The one door for tables: a DataFrame that has these columns."""
+    if not isinstance(data, pd.DataFrame):
+        raise ValueError(f"data: wanted a table, as `tidy` answers, got {type(data).__name__}")
+    for name in columns:
+        if not isinstance(name, str) or name not in data:
+            raise ValueError(f"data has no column {name!r}; it has {', '.join(map(str, data))}")
+    return data
 
 
 def spread(data: pd.DataFrame, key: str, by: str | Sequence[str] = "method") -> pd.DataFrame:
     """Mean over seeds of a figure, its 95 % bootstrap interval, smallest and largest seed.
 
-    Args:
-        data: one row for each seed in each group.
-        key: the figure's column.
-        by: columns that make the groups.
-
-    Returns:
-        By group `mean`, `low`, `high` (percentile bootstrap over seeds; NaN for one seed), `least`,
-        `largest` and `seeds`, their number. Groups without the figure are left out.
-
-    Raises:
-        ValueError: if a seed has several rows in a group.
+    `data` has one row for each seed in each group, else a ValueError says so; `key` is the figure's
+    column, and `by` the columns that make the groups. Answers by group `mean`, `low`, `high`
+    (percentile bootstrap over seeds; NaN for one seed), `least`, `largest` and `seeds`, their
+    number. Groups without the figure are left out.
     """
-    keys = [by] if isinstance(by, str) else [*by]
-    data = data.dropna(subset=[key])
+    keys: list[Any] = [*by] if isinstance(by, list | tuple) else [by]
+    data = _figures(data, key, *(keys or [by]), "seed")
     if data.duplicated([*keys, "seed"]).any():
         raise ValueError(
             f"wanted one row for each seed in a group by {', '.join(keys)}, got several: choose "
@@ -173,6 +177,14 @@ def spread(data: pd.DataFrame, key: str, by: str | Sequence[str] = "method") -> 
     return answer.astype({"seeds": int}) if found else answer
 
 
+def _figures(data: Any, key: str, *columns: Any) -> pd.DataFrame:
+    """The rows that have a figure, a finite number."""
+    x = _table(data, key, *columns)[key]
+    if not pd.api.types.is_numeric_dtype(x) or np.isinf(x.astype(float)).any():
+        raise ValueError(f"key: wanted a column of finite numbers, got {key!r}")
+    return data[x.notna()]
+
+
 def share(
     data: pd.DataFrame, key: str = "success", by: str | Sequence[str] = "method"
 ) -> pd.DataFrame:
@@ -185,17 +197,14 @@ def share(
 def against(data: pd.DataFrame, arm: str, other: str, key: str = "success") -> pd.Series:
     """One method's mean over seeds of a figure, minus another's; `data` has a row for each seed.
 
-    Returns:
-        `difference`, `low`, `high` (95 %, percentile bootstrap over both methods' seeds) and `p`,
-        exact and two-sided: the share of all ways to deal the seeds to two methods that differ as
-        much.
-
-    Raises:
-        ValueError: if a method is missing, or one of its seeds has several rows.
+    Answers `difference`, `low`, `high` (95 %, percentile bootstrap over both methods' seeds) and
+    `p`, exact and two-sided: the share of all ways to deal the seeds to two methods that differ as
+    much. A ValueError says if a method is missing, or one of its seeds has several rows.
     """
     pair = []
     for name in (arm, other):
-        rows = data[data["method"] == name].dropna(subset=[key])
+        rows = _figures(data, key, "method", "seed")
+        rows = rows[rows["method"] == name] if isinstance(name, str) else rows[:0]
         if rows.empty:
             there = ", ".join(data["method"].unique())
             raise ValueError(f"no {key} of {name!r}; there are {there}")
@@ -211,10 +220,14 @@ def against(data: pd.DataFrame, arm: str, other: str, key: str = "success") -> p
 def compare(data: pd.DataFrame, comparisons: Iterable[tuple[str, str, str]]) -> pd.DataFrame:
     """`against` for comparisons (arm, other, key) that were named before looking.
 
-    Returns:
-        A row for each, with `p_holm`: p-values corrected by Holm for all that are in the list.
+    A row for each, with `p_holm`: p-values corrected by Holm for all that are in the list.
     """
-    named = list(comparisons)
+    try:
+        named = [(arm, other, key) for arm, other, key in comparisons]
+    except (TypeError, ValueError):
+        named = []
+    if not named:
+        raise ValueError(f"comparisons: wanted some (arm, other, key), got {comparisons!r}")
     answer = pd.DataFrame([against(data, *three) for three in named])
     answer.index = pd.MultiIndex.from_tuples(named, names=["method", "other", "key"])
     return answer.assign(p_holm=holm(answer["p"]))
@@ -222,7 +235,9 @@ def compare(data: pd.DataFrame, comparisons: Iterable[tuple[str, str, str]]) -> 
 
 def holm(p: ArrayLike) -> np.ndarray:
     """Holm's correction: max over j <= i of (m - j) p_(j) in rising order, at most 1."""
-    p = np.asarray(p, dtype=float)
+    p = checked("p", p, "tests", least=0.0)
+    if (p > 1).any():
+        raise ValueError(f"p: wanted probabilities, got {p.max()}")
     order = np.argsort(p)
     rising = np.maximum.accumulate((len(p) - np.arange(len(p))) * p[order])
     answer = np.empty_like(rising)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import copy
 import gc
-from collections.abc import Sequence
+import sys
 from operator import attrgetter
 from typing import Any, ClassVar
 
@@ -34,6 +34,7 @@ except ImportError as error:
     raise ImportError("cmc.sb3 needs Stable-Baselines3: pip install 'cmc[sb3]'") from error
 
 from cmc.policies import ConvexGradientNetwork, IndependentNetwork, ModularPolicy, PositiveNetwork
+from cmc.theory.arrays import checked, count
 
 __all__ = [
     "BatchedVecEnv",
@@ -51,25 +52,16 @@ class _Modular:
     """What the policy classes share: an action that is a `ModularPolicy` on the observation.
 
     The observation is s, the flat (n, 2) array of (z_i, integral of z_i), or holds it where
-    `layout` says; n is the size of the action.
-
-    Args:
-        observation_space: a Box of one axis.
-        action_space: a Box of one axis, n entries.
-        lr_schedule: of the optimizers, given by the algorithm.
-        network_kwargs: for the network, such as `slope_min`, `slope_max` and `joint_cap`.
-        layout: see `ModularPolicy`, as are `R`, `normalise` and `integral`.
-        R: diagonal of R where the observation does not hold it.
-        normalise: divide by |R_ii| in place of taking the sign alone.
-        integral: False hides the integrals.
-        net_arch: hidden layers by key: of the networks ("pi") and of the critic ("vf" or "qf").
-        **kwargs: for the class of Stable-Baselines3.
+    `layout` says; n is the size of the action. Both spaces are a Box of one axis. `network_kwargs`
+    are for the network, such as `slope_min`, `slope_max` and `joint_cap`; `layout`, `R`,
+    `normalise` and `integral` for `ModularPolicy`; `net_arch` holds hidden layers by key: of the
+    networks ("pi") and of the critic ("vf" or "qf"); the rest is for Stable-Baselines3.
     """
 
     _where: ClassVar[str]  # for which algorithms the class is
     _strange: ClassVar[str]  # an argument that tells another algorithm
     _hidden: ClassVar[dict[str, tuple[int, ...]]]  # layers where net_arch says nothing
-    _more: ClassVar[tuple[str, ...]] = ()  # further arguments for `ModularPolicy`
+    _options: ClassVar[tuple[str, ...]] = ("layout", "R", "normalise", "integral")
     _action: ClassVar[Any]  # where the `ModularPolicy` is
     action_space: Any
 
@@ -80,30 +72,19 @@ class _Modular:
         lr_schedule: Any = None,
         *,
         network_kwargs: dict[str, Any] | None = None,
-        layout: dict[str, slice] | None = None,
-        R: Any = 1.0,
-        normalise: bool = False,
-        integral: bool = True,
         net_arch: Any = None,
         **kwargs: Any,
     ) -> None:
-        if lr_schedule is None or self._strange in kwargs:
+        if not callable(lr_schedule) or self._strange in kwargs:
             raise TypeError(f"{type(self).__name__} {self._where}")
-        _check_spaces(observation_space, action_space, layout)
-        sizes: dict[str, Sequence[int]] = dict(self._hidden)
-        if net_arch is not None:  # as in Stable-Baselines3, a key left out means no hidden layer
-            both = net_arch if isinstance(net_arch, dict) else dict.fromkeys(sizes, net_arch)
-            sizes = {name: both.get(name, ()) for name in sizes}
-        self._modular = {"layout": layout, "R": R, "normalise": normalise, "integral": integral}
-        self._modular |= {name: kwargs.pop(name) for name in self._more if name in kwargs}
-        self._asked = {
-            **self._modular,
-            "network_kwargs": dict(network_kwargs or {}),
-            "net_arch": {name: list(layers) for name, layers in sizes.items()},
-        }
-        super().__init__(
-            observation_space, action_space, lr_schedule, self._their_sizes(), **kwargs
-        )  # type: ignore[call-arg]
+        if not isinstance(network_kwargs, dict | None):
+            raise ValueError(f"network_kwargs: wanted a dictionary, got {network_kwargs!r}")
+        self._modular = {name: kwargs.pop(name) for name in self._options if name in kwargs}
+        _check_spaces(observation_space, action_space, self._modular)
+        sizes = _layers(net_arch, self._hidden)
+        own = {"network_kwargs": dict(network_kwargs or {}), "net_arch": sizes}
+        self._asked, both = self._modular | own, (observation_space, action_space)
+        super().__init__(*both, lr_schedule, self._their_sizes(), **kwargs)  # type: ignore[call-arg]
 
     def _their_sizes(self) -> Any:
         """Hidden layers as the class of Stable-Baselines3 builds them."""
@@ -124,7 +105,8 @@ class _ActorCritic(_Modular, ActorCriticPolicy):
         "is for PPO, A2C and their like, which ask a policy for a Gaussian action and a value; "
         "for TD3 and DDPG there is ContractingTD3Policy"
     )
-    _strange, _more, _action = "n_critics", ("u0",), attrgetter("action_net")
+    _strange, _action = "n_critics", attrgetter("action_net")
+    _options = (*_Modular._options, "u0")
     _hidden: ClassVar = {"pi": (32, 32), "vf": (64, 64)}
     network: ClassVar[Any]
 
@@ -137,11 +119,8 @@ class _ActorCritic(_Modular, ActorCriticPolicy):
         hidden = hidden[0] if self.network is ConvexGradientNetwork else hidden
         network = self.network(self.action_space.shape[0], hidden=hidden, **kwargs)
         self.action_net = ModularPolicy(network, **self._modular)
-        self.optimizer = self.optimizer_class(  # again, because a module was replaced
-            self.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
+        options: Any = {"lr": lr_schedule(1), **self.optimizer_kwargs}
+        self.optimizer = self.optimizer_class(self.parameters(), **options)  # a module is new
 
     @property
     def actor(self) -> ModularPolicy:
@@ -213,20 +192,36 @@ class ContractingTD3Policy(_Modular, TD3Policy):
         return self.on_signals().slope_bounds()
 
 
-def _check_spaces(
-    seen: spaces.Space[Any], action: spaces.Space[Any], layout: dict[str, slice] | None
-) -> None:
-    """Refuse spaces that hold no (n, 2) signals for n actions, or a layout that does not fit."""
+def _layers(net_arch: Any, usual: dict[str, tuple[int, ...]]) -> dict[str, list[int]]:
+    """Hidden layers by key; as in Stable-Baselines3, a key left out of a dictionary means none."""
+    given = usual if net_arch is None else net_arch
+    given = given if isinstance(given, dict) else dict.fromkeys(usual, given)
+    lists = all(isinstance(layers, list | tuple) for layers in given.values())
+    if not lists or not set(given) <= set(usual):
+        raise ValueError(f"net_arch: wanted sizes for {', '.join(usual)}, got {net_arch!r}")
+    return {name: [count("net_arch", n) for n in given.get(name, ())] for name in usual}
+
+
+def _check_spaces(seen: Any, action: Any, options: dict[str, Any]) -> None:
+    """Refuse spaces that hold no (n, 2) signals for n actions, or options that do not fit."""
     if not isinstance(action, spaces.Box) or len(action.shape) != 1:
         raise ValueError(f"wanted actions in a Box of one axis; got {action}")
-    n, shape = action.shape[0], seen.shape or ()
-    if layout is None and shape != (2 * n,):
+    layout, n = options.get("layout"), action.shape[0]
+    shape: tuple[int, ...] = getattr(seen, "shape", None) or ()
+    if not isinstance(seen, spaces.Box) or (layout is None and shape != (2 * n,)):
         raise ValueError(
             f"wanted observations of shape ({2 * n},), (z_i, integral of z_i) for each of "
-            f"{n} actions, or a layout; got {seen.shape}"
+            f"{n} actions, or a layout; got {shape or seen}"
         )
+    checked("R", options.get("R", 1.0))
+    for name in {"normalise", "integral"} & set(options):
+        if not isinstance(options[name], bool):
+            raise ValueError(f"{name}: wanted True or False, got {options[name]!r}")
+    parts = {} if layout is None else layout
+    if not isinstance(parts, dict) or not all(isinstance(p, slice) for p in parts.values()):
+        raise ValueError(f"layout: wanted slices by name, got {layout!r}")
     wanted = {"s": 2 * n, "R": n, "T_a": n * n}
-    for name, part in (layout or {}).items():
+    for name, part in parts.items():
         inside = range(*part.indices(shape[0])) if len(shape) == 1 else range(0)
         if name in wanted and (len(inside) != wanted[name] or (part.stop or 0) > shape[0]):
             raise ValueError(
@@ -248,9 +243,9 @@ def _normalisation(policy: nn.Module) -> Any:
 class _OnSignals:
     """A `ModularPolicy` as it acts in a loop: w pi((s - mean) / std), or w tanh(pi(...)).
 
-    VecNormalize (`scales`, or None) gives mean and std and clips: its slopes are 1/std times as
-    large, and vanish where it clips. An off-policy algorithm scales actions from [-1, 1] to the
-    action space (`box`, or None): w is half its width, its middle joins `u0`.
+    VecNormalize (`scales`) gives mean and std and clips: its slopes are 1/std times as large, and
+    vanish where it clips. An off-policy algorithm scales actions from [-1, 1] to the action space
+    (`box`): w is half its width, its middle joins `u0`.
     """
 
     def __init__(
@@ -289,27 +284,21 @@ class BatchedVecEnv(VecEnv):
     """A batched Gymnasium vector environment, one that restarts in the same step, as a `VecEnv`."""
 
     def __init__(self, env: VectorEnv[Any, Any, Any]) -> None:
+        if not isinstance(env, VectorEnv):
+            raise ValueError(f"env: wanted a vector environment of Gymnasium, got {env!r}")
         mode = env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP)
         if mode != AutoresetMode.SAME_STEP:
-            raise ValueError(
-                "wanted a vector environment that restarts in the same step (autoreset_mode="
-                f"AutoresetMode.SAME_STEP), as Stable-Baselines3 expects; got {mode}"
-            )
+            wanted = "autoreset_mode=AutoresetMode.SAME_STEP, as Stable-Baselines3 expects"
+            raise ValueError(f"env: wanted a restart in the same step, {wanted}; got {mode}")
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-        self._seed: int | None = None
         self._actions: Any = None
         self._return, self._length = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=int)
 
-    def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Use `seed` at the next reset."""
-        self._seed = seed
-        return [seed] * self.num_envs
-
     def reset(self) -> Any:
         """Start all trajectories."""
-        observation, _ = self.env.reset(seed=self._seed)
-        self._seed = None
+        observation, _ = self.env.reset(seed=self._seeds[0])  # as `seed` has set them
+        self._reset_seeds()
         self._return[:], self._length[:] = 0.0, 0
         return observation
 
@@ -349,3 +338,7 @@ class BatchedVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """No trajectory of a batch is wrapped."""
         return [False] * len(list(self._get_indices(indices)))
+
+
+for _name in ("actor_critic", "td3"):  # modules that files name which an earlier version saved
+    sys.modules.setdefault(f"{__name__}.{_name}", sys.modules[__name__])

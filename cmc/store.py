@@ -7,6 +7,7 @@ is written to a temporary name, flushed, and renamed.
 
 from __future__ import annotations
 
+import errno
 import glob
 import hashlib
 import json
@@ -33,11 +34,18 @@ class CheckpointError(ValueError):
 
 def asset(*parts: str) -> Path:
     """Path of a shipped asset, in a checkout or in an installed wheel, or FileNotFoundError."""
-    package = Path(__file__).resolve().parent
+    package, inside = Path(__file__).resolve().parent, Path(*(as_path("asset", p) for p in parts))
     for root in (package / "assets", package.parent / "assets"):
-        if root.joinpath(*parts).exists():
-            return root.joinpath(*parts)
-    raise FileNotFoundError(f"no asset {'/'.join(parts)!r} is shipped with cmc")
+        if (root / inside).exists():
+            return root / inside
+    raise FileNotFoundError(f"no asset '{inside}' is shipped with cmc")
+
+
+def as_path(name: str, value: str | Path) -> Path:
+    """A path, or a ValueError that names the argument."""
+    if not isinstance(value, (str, Path)):
+        raise ValueError(f"{name}: wanted a path, got {value!r}")
+    return Path(value)
 
 
 def write_atomic(path: str | Path, write: Callable[[IO[bytes]], Any]) -> Path:
@@ -46,55 +54,66 @@ def write_atomic(path: str | Path, write: Callable[[IO[bytes]], Any]) -> Path:
     If writing fails (a full disk, an interrupt), the earlier file is untouched and the temporary
     one is removed; what a killed process left is removed by the next one that writes the file.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _remove_left_over(path)
-    temporary = path.with_name(f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    path = as_path("path", path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        code = errno.ENOTDIR
+        raise NotADirectoryError(code, os.strerror(code), str(path.parent)) from error
+    own = f".{path.name}.{_HOST}-"
+    for left in path.parent.glob(f"{glob.escape(own)}*.tmp"):
+        pid = left.name.removeprefix(own).split("-")[0]
+        if pid.isdigit() and not alive(int(pid)):
+            left.unlink(missing_ok=True)
+    temporary = path.with_name(f"{own}{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("xb") as file:
             write(file)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            error.filename = str(path)
         raise
     return path
 
 
-def _remove_left_over(path: Path) -> None:
-    """Remove temporary files of this machine's processes that are no more."""
-    for left in path.parent.glob(f".{glob.escape(path.name)}.{_HOST}-*.tmp"):
-        pid = left.name.removeprefix(f".{path.name}.{_HOST}-").split("-")[0]
-        if pid.isdigit() and not alive(int(pid)):
-            left.unlink(missing_ok=True)
-
-
 def alive(pid: int) -> bool:
     """Whether a process of this machine is there; always true where that cannot be asked."""
-    if os.name != "posix":
-        return True
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
+    if os.name == "posix":
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return False
+        except PermissionError:
+            pass
     return True
 
 
 def write_json(path: str | Path, content: Mapping[str, Any]) -> Path:
     """Write `content` as JSON (NaN and infinity are refused), atomically."""
-    if not isinstance(content, Mapping):
-        raise ValueError(f"content: wanted an object of names and values, got {content!r}")
-    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    text = as_json("content", content, indent=1) + "\n"
     return write_atomic(path, lambda file: file.write(text.encode()))
+
+
+def as_json(name: str, content: Any, *needed: str, indent: int | None = None) -> str:
+    """An object as JSON, or a ValueError that names the argument and what is wrong with it."""
+    if not isinstance(content, Mapping):
+        raise ValueError(f"{name}: wanted an object of names and values, got {content!r}")
+    if missing := [key for key in needed if not isinstance(content.get(key), str)]:
+        raise ValueError(f"{name}: lacks {missing}")
+    try:
+        return json.dumps(dict(content), indent=indent, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def read_json(path: str | Path) -> dict[str, Any]:
     """Read a JSON object; a ValueError if the file does not hold one."""
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        content = json.loads(as_path("path", path).read_text(encoding="utf-8"))
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"{path} is not JSON: {error}") from error
     if not isinstance(content, dict):
@@ -104,6 +123,10 @@ def read_json(path: str | Path) -> dict[str, Any]:
 
 def provenance(command: str, seeds: list[int]) -> dict[str, Any]:
     """What produced a file: the command, seeds, commit and versions."""
+    if not (
+        isinstance(command, str) and isinstance(seeds, list) and all(type(s) is int for s in seeds)
+    ):
+        raise ValueError(f"command, seeds: wanted text and integers, got {command!r}, {seeds!r}")
     there = [n for n in ("numpy", "scipy", "torch", "mujoco", "gymnasium") if n in sys.modules]
     versions = {"python": platform.python_version()} | {n: metadata.version(n) for n in there}
     return {"command": command, "seeds": seeds, "commit": _commit(), "versions": versions}
@@ -125,21 +148,17 @@ def _commit() -> str:
 def save_checkpoint(
     path: str | Path, tensors: Mapping[str, np.ndarray], record: Mapping[str, Any]
 ) -> Path:
-    """Write finite arrays and their JSON record as one safetensors file, atomically.
-
-    Raises:
-        ValueError: if an array is not finite or the record lacks `study` or `method`.
-    """
+    """Write finite arrays, and a JSON record with study and method, as one safetensors file."""
     from safetensors.numpy import save
 
-    missing = {"study", "method"} - set(record)
-    if missing:
-        raise ValueError(f"the checkpoint record lacks {sorted(missing)}")
+    text = as_json("record", record, "study", "method")
+    if not isinstance(tensors, Mapping):
+        raise ValueError(f"tensors: wanted arrays by name, got {tensors!r}")
+    for name, array in tensors.items():
+        numbers = isinstance(array, np.ndarray) and array.dtype.kind in "biuf"
+        if not (isinstance(name, str) and numbers and np.isfinite(array).all()):
+            raise ValueError(f"tensor {name!r} is not finite numbers: nothing is written to {path}")
     arrays = {name: np.ascontiguousarray(array) for name, array in tensors.items()}
-    for name, array in arrays.items():
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise ValueError(f"tensor {name!r} is not finite: nothing was written to {path}")
-    text = json.dumps(dict(record), allow_nan=False)
     header = {"format": _FORMAT, "record": text, "digest": _digest(arrays, text)}
     data = save(arrays, metadata=header)
     return write_atomic(path, lambda file: file.write(data))
@@ -150,17 +169,13 @@ def load_checkpoint(
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays by name, and the record, from a file that `save_checkpoint` wrote.
 
-    Args:
-        path: the file.
-        study: if given, the study it must belong to.
-        method: if given, the method it must have been trained with.
-
     Raises:
-        CheckpointError: if it is missing, damaged, pickled, foreign or of another study/method.
+        CheckpointError: if it is missing, damaged, pickled, foreign, or of another study or method
+            than these, where they are given.
     """
     from safetensors import SafetensorError, safe_open
 
-    path = Path(path)
+    path = as_path("path", path)
     if not path.is_file():
         raise CheckpointError(f"no checkpoint at {path}")
     try:
@@ -168,10 +183,7 @@ def load_checkpoint(
             header = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, TypeError, ValueError, KeyError) as error:
-        raise CheckpointError(
-            f"{path} is not a complete safetensors file ({error}); "
-            "truncated, pickled and foreign files are refused"
-        ) from error
+        raise CheckpointError(f"{path} is not a complete safetensors file ({error})") from error
     form, text = header.get("format"), header.get("record", "")
     if form != _FORMAT:
         raise CheckpointError(f"{path}: wanted a file of format {_FORMAT!r}, found {form!r}")
@@ -180,9 +192,8 @@ def load_checkpoint(
     record: dict[str, Any] = json.loads(text)
     for key, wanted in (("study", study), ("method", method)):
         if wanted is not None and record[key] != wanted:
-            raise CheckpointError(
-                f"{path}: wanted a checkpoint of {key} {wanted!r}, found {record[key]!r}"
-            )
+            said = f"wanted a checkpoint of {key} {wanted!r}, found {record[key]!r}"
+            raise CheckpointError(f"{path}: {said}")
     return tensors, record
 
 

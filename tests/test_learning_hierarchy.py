@@ -12,7 +12,7 @@ from cmc.envs.peg_maze import PegMaze
 from cmc.learning.hierarchy import HierarchyConfig, play
 from cmc.learning.planning import SegmentEnv
 from cmc.studies import peg_maze, peg_push
-from cmc.studies.two_level_arms import frozen, latent, two_level
+from cmc.studies.two_level import frozen, latent, two_level
 
 MAZE, PUSH = peg_maze.STUDY.config, peg_push.STUDY.config
 
@@ -51,7 +51,7 @@ def test_sub_goals_scatter_by_the_noise_of_the_moment(steps):
     calm = replace(PUSH.hierarchy, redraw=(0.0, 0.0), burst=(0.0, 0.0))
     trainer, seen = planner(replace(PUSH, hierarchy=calm))
     trainer.steps = steps
-    action = trainer._choose(seen, np.zeros(()))
+    action = trainer._choose(seen)
     assert np.std(action) == pytest.approx(calm.exploration(steps)[0], rel=0.1)
 
 
@@ -60,7 +60,7 @@ def test_redraws_and_bursts_come_as_often_as_asked_and_bursts_last():
     rates = replace(PUSH.hierarchy, **calm, redraw=(0.1, 0.1), burst=(0.05, 0.05))
     trainer, seen = planner(replace(PUSH, hierarchy=rates))
     trainer.steps = 10_000
-    drawn = np.array([trainer._choose(seen, np.zeros(()))[0] != 0 for _ in range(60)])
+    drawn = np.array([trainer._choose(seen)[0] != 0 for _ in range(60)])
     whole = drawn.all(-1)  # (60, worlds): in a burst, or by six redraws of one in ten
     share = 3 * 0.05 / (1 + 2 * 0.05)  # three segments each; none begins within another
     assert whole[3:].mean() == pytest.approx(share, rel=0.15)

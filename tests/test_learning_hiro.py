@@ -15,14 +15,13 @@ from cmc.learning.hiro import (
     CANDIDATES,
     JointLow,
     JointUnits,
-    Normalised,
     OffPolicyCorrection,
     PullActor,
     candidates,
     log_likelihood,
     subgoal_transition,
 )
-from cmc.learning.low_level import Segment, evaluate, low_fields, rollout
+from cmc.learning.low_level import Segment, rollout
 from cmc.learning.td3 import TD3, Batch, TD3Config
 from cmc.studies import peg_maze
 
@@ -184,17 +183,6 @@ def test_relabelling_never_makes_the_actions_less_likely_and_resumes() -> None:
     torch.testing.assert_close(correction.relabel(batch).action, found.action)
     with pytest.raises(ValueError, match="stride: wanted 1 to 5"):
         OffPolicyCorrection(low, seeds, T, stride=6)
-
-
-def test_a_frozen_actor_answers_as_the_learner_without_noise() -> None:
-    task, low = joint_low([7])
-    task.reset()
-    obs = task.set_subgoal(np.full((2, 7), 0.03))
-    seen = task.select(obs, low_fields(task))[None]
-    expected = low.act(seen, explore=False)
-    found = evaluate(Normalised(low.agent.actor, low.units), seen)
-    np.testing.assert_allclose(found, expected, atol=1e-5)
-    assert np.abs(found).max() > 0.0
 
 
 def test_the_first_random_sub_goals_lie_around_the_maze() -> None:

@@ -13,7 +13,7 @@ from torch import nn
 from cmc.learning.latent import LatentConfig, LatentLow, LatentModel
 from cmc.learning.low_level import Segment
 from cmc.studies import peg_push
-from cmc.studies.two_level_arms import latent
+from cmc.studies.two_level import latent
 
 K_P, K_D, K1, K2, ACTION, MASS, TICK, TICKS = 20.0, 30.0, 29.0, 0.7, 0.8, 3.0, 0.02, 20
 

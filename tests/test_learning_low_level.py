@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from cmc import plants
 from cmc.learning.low_level import evaluate, latent_policy, set_gain
-from cmc.policies import IndependentNetwork, LinearNetwork, PositiveNetwork
+from cmc.policies import IndependentNetwork, LinearNetwork, ModularPolicy, PositiveNetwork
+from cmc.theory.certify import certify
+from cmc.theory.slopes import action_of
 
 SEEDS = [3, 8]
 CAP = (np.array([1.0, 0.02]), np.full(6, 30.0))
@@ -55,3 +58,16 @@ def test_positive_slopes_pull_towards_the_sub_goal_and_stay_within_one():
     integral = np.random.default_rng(1).normal(size=(2, 5, 6))
     seen = np.concatenate([y, integral, np.ones((2, 5, 13))], -1)
     np.testing.assert_allclose(evaluate(actor, seen), np.tanh(2 * y + 3 * integral), atol=1e-6)
+
+
+def test_a_tanh_at_the_end_leaves_no_floor():
+    """Behind a tanh an unstable plant escapes from far away: nothing is certified everywhere."""
+    plant = plants.LinearPlant([[0.5]], [[1.0]])
+    network = PositiveNetwork(1, slope_min=[2.0, 0.5], slope_max=[3.0, 1.0])
+    assert certify(ModularPolicy(network), plant)
+    assert not certify(ModularPolicy(network, squash=True), plant)
+    s = np.random.default_rng(0).normal(size=(9, 1, 2))
+    policy = ModularPolicy(network, squash=True)
+    with torch.no_grad():
+        wanted = policy(torch.as_tensor(s.reshape(9, 2), dtype=torch.float32)).numpy()
+    np.testing.assert_allclose(action_of(policy, 1)(s, np.ones(1)), wanted, atol=1e-5)

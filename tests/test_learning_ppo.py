@@ -272,7 +272,7 @@ def test_bad_hyperparameters(options, match):
 def test_bad_seeds():
     env = PegTouchVectorEnv(num_envs=5)
     policy = ModularPolicy(PositiveNetwork(2, seeds=[0, 1]))
-    with pytest.raises(ValueError, match="at least one seed"):
+    with pytest.raises(ValueError, match="seeds: wanted at least one"):
         PPO(env, policy, [])
     with pytest.raises(ValueError, match="divides 5"):
         PPO(env, policy, [0, 1])

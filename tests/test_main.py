@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 import signal
 import subprocess
@@ -33,9 +35,8 @@ def test_train_goes_on_and_ship_puts_it_among_the_assets(tmp_path: Path, capsys)
     assert "return" in shown.err  # how well it goes, beside the time that is left
     assert "peg_touch_cppo.safetensors" in shown.out
     assert main([*CPPO[:-1], "3", "--out", str(run)]) == 2
-    assert "is a run of seeds [0, 1], not [0, 1, 2]: use another folder (--out)" in (
-        capsys.readouterr().err
-    )
+    said = capsys.readouterr().err
+    assert "seeds [0, 1], not [0, 1, 2]: go on with it by --seeds 2, use another folder" in said
     assert main(["ship", "peg_touch", str(tmp_path / "none"), "--assets", str(assets)]) == 2
 
 
@@ -69,15 +70,21 @@ def test_play_says_what_the_episode_did_and_writes_it(tmp_path: Path, capsys) ->
         (["train", "peg_pull"], "unknown study 'peg_pull'; wanted one of peg_touch"),
         (["train", "peg_touch", "--method", "sac"], "unknown method 'sac'"),
         (["train", "peg_push", "--method", "hiro"], "unknown method 'hiro'"),
-        ([*CPPO[:-1], "0"], "seeds: wanted at least one, got none"),
-        ([*CPPO, "--episodes", "0"], "episodes: wanted at least 1, got 0"),
+        ([*CPPO[:-1], "0"], "seeds: wanted at least one"),
+        ([*CPPO, "--episodes", "0"], "length (episodes) needs"),
         ([*CPPO, "--steps", "3"], "use --episodes"),
-        ([*CPPO, "--jobs", "0"], "at least 1, got 0"),
+        ([*CPPO, "--jobs", "0"], "jobs needs"),
         ([*CPPO, "--address", "nowhere"], "--address: only with --backend dask"),
         (["train", "peg_maze", "--method", "frozen", "--episodes", "3"], "use --steps"),
         (["train", "peg_touch", "--method", "pi"], "fixed gains"),
         (["evaluate", "peg_touch", "--method", "sac"], "unknown method 'sac'"),
-        (["evaluate", "peg_push", "--trajectories", "0"], "at least 1"),
+        (["evaluate", "peg_push", "--trajectories", "0"], "trajectories needs"),
+        (["evaluate", "peg_touch", "--checkpoints", "x"], "no checkpoint of peg_touch in x"),
+        (["evaluate", "composition", "--method", "x"], "--method: not for a table"),
+        (["play", "peg_maze", "--live", "--beside", "nope"], "unknown method 'nope'"),
+        (["play", "peg_maze", "--beside", ""], "unknown method ''"),
+        (["play", "peg_maze", "--live", "--checkpoint", "x"], "--checkpoint: not with a live page"),
+        (["play", "peg_maze", "--live", "--out", "x.png"], "--out: wanted a .html file"),
         (["evaluate", "peg_maze", "--method", "frozen", "--checkpoints", "."], "no checkpoint"),
         (["play", "peg_touch", "--method", "pi", "--out", "motion.gif"], ".png"),
         (["play", "peg_touch", "--method", "cppo", "--seed", "9"], "seed: wanted a position"),
@@ -92,6 +99,19 @@ def test_wrong_requests_are_one_sentence_each(request_, message, tmp_path, capsy
     said = capsys.readouterr().err.splitlines()[-1]
     assert message in said
     assert said.startswith("python -m cmc ")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_says_how_to_go_on(tmp_path: Path, capsys, monkeypatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert main([*CPPO, "--episodes", "16", "--out", str(tmp_path)]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert (
+        f"No space left on device: '{tmp_path / 'peg_touch_cppo.safetensors'}'; make room" in said
+    )
     assert not list(tmp_path.iterdir())
 
 

@@ -152,6 +152,26 @@ def test_what_is_written_is_read_again(tmp_path: object) -> None:
         results.read(path)
 
 
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: at(tidy("peg_push"), 7), "when: wanted one of"),
+        (lambda: at(tidy("peg_push"), test="none"), "test: wanted one of"),
+        (lambda: at(tidy("peg_touch"), h=0.5), "h: wanted one of"),
+        (lambda: at([1]), "data: wanted a table"),
+        (lambda: spread(PUSH, "nothing"), "data has no column 'nothing'"),
+        (lambda: spread(PUSH, "title"), "key: wanted a column of finite numbers"),
+        (lambda: spread(PUSH.assign(success=np.inf), "success"), "key: wanted .* finite"),
+        (lambda: compare(PUSH, []), "comparisons: wanted some"),
+        (lambda: holm([0.1, np.nan]), "p needs finite"),
+        (lambda: holm([1.5]), "p: wanted probabilities"),
+    ],
+)
+def test_what_has_no_answer_is_refused_by_name(call, message: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=message):
+        call()
+
+
 def test_unknown_tables_and_studies_are_named() -> None:
     with pytest.raises(ValueError, match="table: wanted one of tests, curves"):
         tidy("peg_push", "nothing")

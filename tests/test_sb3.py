@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import base64
+import importlib
+import json
+import zipfile
+
 import gymnasium
 import numpy as np
 import pytest
@@ -33,9 +38,7 @@ from cmc.theory.exact import Region
 from cmc.theory.slopes import action_of
 
 PEG = "cmc.envs:cmc/PegTouch-v0"
-
-UPDATES = 40
-CONFIG = PPOConfig(critic_hidden=(32, 32))
+UPDATES, CONFIG = 40, PPOConfig(critic_hidden=(32, 32))
 KWARGS = {"log_std_init": CONFIG.log_std_start, "net_arch": {"pi": [16, 16], "vf": [32, 32]}}
 ALIKE = {"n_steps": 50, "batch_size": 200, "n_epochs": 4, "learning_rate": CONFIG.learning_rate}
 
@@ -51,31 +54,27 @@ class WithoutPrivileged(PegTouchVectorEnv):
         return *result, {"final_obs": info["final_obs"]} if "final_obs" in info else {}
 
 
-class Returns(BaseCallback):
-    def __init__(self):
-        super().__init__()
-        self.history = []
-
-    def _on_step(self):
-        return True
-
-    def _on_rollout_end(self):
-        self.history.append(np.mean([e["r"] for e in list(self.model.ep_info_buffer)[-16:]]))
-
-
 def test_learns_as_ours_does():
     torch.set_num_threads(1)
-    returns = Returns()
+    returns = []
+
+    class Returns(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            returns.append(np.mean([e["r"] for e in list(self.model.ep_info_buffer)[-16:]]))
+
     env = BatchedVecEnv(PegTouchVectorEnv(num_envs=16))
     model = SB3PPO(ContractingPolicy, env, policy_kwargs=KWARGS, seed=0, device="cpu", **ALIKE)
-    model.learn(16 * 50 * UPDATES, callback=returns)
+    model.learn(16 * 50 * UPDATES, callback=Returns())
     history, seeds = [], [0, 1, 2]
     policy = ModularPolicy(PositiveNetwork(2, seeds=seeds, hidden=(16, 16)))
     ppo = PPO(WithoutPrivileged(num_envs=16 * len(seeds)), policy, seeds, CONFIG)
     ppo.train(UPDATES, lambda row: history.append(row["episode_return"]))
-    assert len(returns.history) == len(history) == UPDATES
+    assert len(returns) == len(history) == UPDATES
     first, ours = np.mean(history[:5]), np.mean(history[-5:], axis=0)
-    theirs = np.mean(returns.history[-5:])
+    theirs = np.mean(returns[-5:])
     assert min(theirs, ours.min()) > first + 6.0  # all have learnt
     assert abs(theirs - ours.mean()) < 3.0 * max(ours.std(ddof=1), 3.0)
 
@@ -97,6 +96,17 @@ def test_save_and_load(tmp_path, kind):
     model.learn(128)
     observation = np.random.default_rng(0).standard_normal((9, 4)).astype(np.float32)
     saved_and_loaded_alike(model, observation, tmp_path)
+
+
+def test_a_file_that_names_a_module_of_an_earlier_version_loads(tmp_path, monkeypatch):
+    with monkeypatch.context() as earlier:
+        earlier.setattr(ContractingPolicy, "__module__", "cmc.sb3.actor_critic")
+        model = SB3PPO(ContractingPolicy, PegTouchEnv(), n_steps=64, device="cpu")
+        model.save(tmp_path / "earlier.zip")
+    data = json.loads(zipfile.ZipFile(tmp_path / "earlier.zip").read("data"))
+    assert b"actor_critic" in base64.b64decode(data["policy_class"][":serialized:"])
+    again = SB3PPO.load(tmp_path / "earlier.zip", device="cpu")
+    assert type(again.policy) is importlib.import_module("cmc.sb3.td3").ContractingPolicy
 
 
 def test_the_promised_slopes_hold_in_the_action_that_is_taken():
@@ -164,8 +174,7 @@ def lags(scales=None, clip_obs=10.0):
     if scales is not None:
         env = VecNormalize(env, norm_reward=False, training=False, clip_obs=clip_obs)
         env.obs_rms.mean[:], env.obs_rms.var[:] = 0.0, np.square(scales)
-    slopes = {"slope_min": [0.5, 0.5], "slope_max": [1.5, 1.0]}
-    kwargs = {"network_kwargs": slopes}
+    kwargs = {"network_kwargs": {"slope_min": [0.5, 0.5], "slope_max": [1.5, 1.0]}}
     return SB3PPO(ContractingPolicy, env, policy_kwargs=kwargs, n_steps=64, seed=0, device="cpu")
 
 
@@ -193,30 +202,33 @@ def test_what_the_theory_sees_is_what_the_model_does():
 
 
 def test_edges_of_other_algorithms_spaces_and_layouts():
-    peg, rate = PEG, lambda _: 1e-3  # pictures are asked for and refused, and all goes on
-    action, seen = spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (5,))
-    with pytest.raises(ValueError, match=r"shape \(4,\)"):
-        ContractingPolicy(seen, action, rate)
-    with pytest.raises(ValueError, match="Box of one axis"):
-        ContractingPolicy(seen, spaces.Discrete(3), rate)
+    rate, pendulum = lambda _: 1e-3, gymnasium.make("Pendulum-v1")
+    action, seen, own = spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (5,)), spaces.Box(-1, 1, (4,))
+    gaussian, there = "for PPO, A2C and their like", "for TD3 and DDPG.*there is ContractingPolicy"
+    sync = gymnasium.make_vec(PEG, num_envs=2, vectorization_mode="sync")
+    wide = {"layout": {"s": slice(0, 9)}}
+    for call, message in (
+        (lambda: ContractingPolicy(seen, action, rate), r"shape \(4,\)"),
+        (lambda: ContractingPolicy(seen, spaces.Discrete(3), rate), "Box of one axis"),
+        (lambda: ContractingPolicy(own, action, rate, net_arch=[0]), "net_arch needs"),
+        (lambda: ContractingPolicy(own, action, rate, net_arch={"qf": [3]}), "net_arch: wanted"),
+        (lambda: ContractingPolicy(own, action, rate, R=np.nan), "R needs finite"),
+        (lambda: ContractingPolicy(own, action, rate, integral=3), "integral: wanted True"),
+        (lambda: SB3PPO(ContractingPolicy, PEG, policy_kwargs=wide), "layout: 's' needs 4 numbers"),
+        (lambda: TD3(ContractingPolicy, PEG, buffer_size=9), "there is ContractingTD3Policy"),
+        (
+            lambda: TD3(ContractingTD3Policy, pendulum, buffer_size=9),
+            r"of shape \(2,\).*got \(3,\)",
+        ),
+        (lambda: BatchedVecEnv(sync), "env: wanted a restart in the same step"),
+        *((lambda a=a: a(ContractingPolicy, PEG, buffer_size=9), gaussian) for a in (SAC, DDPG)),
+        *((lambda a=a: a(ContractingTD3Policy, PEG), there) for a in (SB3PPO, SAC)),
+    ):
+        with pytest.raises((ValueError, TypeError, AttributeError), match=message):
+            call()
     assert ContractingPolicy(seen, action, rate, layout={"s": slice(1, 5)}).actor.n == 2
-    model = SB3PPO(ContractingPolicy, peg, policy_kwargs={"net_arch": {"pi": [16]}}, n_steps=64)
+    model = SB3PPO(ContractingPolicy, PEG, policy_kwargs={"net_arch": {"pi": [16]}}, n_steps=64)
     assert model.policy.net_arch["vf"] == []
-    kwargs = {"layout": {"s": slice(0, 9)}}
-    with pytest.raises(ValueError, match="layout: 's' needs 4 numbers"):
-        SB3PPO(ContractingPolicy, peg, policy_kwargs=kwargs, n_steps=64)
-    for algorithm in (SAC, TD3, DDPG):
-        with pytest.raises((AttributeError, TypeError), match="for PPO, A2C and their like"):
-            algorithm(ContractingPolicy, peg, buffer_size=10)
-    with pytest.raises(AttributeError, match=r"there is ContractingTD3Policy"):
-        TD3(ContractingPolicy, peg, buffer_size=10)
-    for algorithm in (SB3PPO, SAC):
-        with pytest.raises(TypeError, match=r"for TD3 and DDPG.*there is ContractingPolicy"):
-            algorithm(ContractingTD3Policy, peg)
-    with pytest.raises(ValueError, match=r"wanted observations of shape \(2,\).*got \(3,\)"):
-        TD3(ContractingTD3Policy, gymnasium.make("Pendulum-v1"), buffer_size=10)
-    with pytest.raises(ValueError, match="restarts in the same step"):
-        BatchedVecEnv(gymnasium.make_vec(PEG, num_envs=2, vectorization_mode="sync"))
 
 
 class Slow(gymnasium.Env):
@@ -252,19 +264,15 @@ def td3():
     return model
 
 
-def test_the_contracting_actor_of_td3_acts_and_is_saved(td3, tmp_path):
+def test_the_contracting_actor_of_td3_acts_is_saved_and_keeps_its_signs_and_caps(td3, tmp_path):
     s = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
     taken = td3.predict(s, deterministic=True)[0]
     pi = action_of(td3.policy.on_signals(), 2)
     wanted = [1.0, 0.0] + pi(s.reshape(50, 2, 2).astype(float), np.array([1.0, -1.0]))
     np.testing.assert_allclose(taken, wanted, atol=1e-5)
-    assert set(map(id, td3.actor.optimizer.param_groups[0]["params"])) == set(
-        map(id, td3.actor.parameters())
-    )
+    optimised = td3.actor.optimizer.param_groups[0]["params"]
+    assert set(map(id, optimised)) == set(map(id, td3.actor.parameters()))
     saved_and_loaded_alike(td3, s, tmp_path)
-
-
-def test_the_contracting_actor_of_td3_keeps_its_signs_and_caps(td3):
     low, high = td3.policy.slope_bounds()
     assert (low == 0).all()  # tanh saturates
     assert (high <= np.array([[2.0 * 0.5, 2.0 * 0.3], [4.0 * 0.5, 4.0 * 0.3]]) + 1e-6).all()
@@ -279,8 +287,7 @@ def test_the_contracting_actor_of_td3_keeps_its_signs_and_caps(td3):
 
 
 def test_what_the_algorithms_hold_can_be_certified_in_a_box(td3):
-    slopes = {"slope_min": 0.2, "slope_max": [0.6, 0.6]}
-    kwargs = {"network_kwargs": slopes}
+    kwargs = {"network_kwargs": {"slope_min": 0.2, "slope_max": [0.6, 0.6]}}
     ppo = SB3PPO(ContractingPolicy, PegTouchEnv(), policy_kwargs=kwargs, n_steps=64)
     region = Region([1.0, -8.0], [3.0, -1.0])
     answer = certify(ppo.policy, plants.get("peg"), region=region, y_ref=[2.0, -4.0])
@@ -291,16 +298,3 @@ def test_what_the_algorithms_hold_can_be_certified_in_a_box(td3):
     near = Region([-0.3] * 2, [0.3] * 2, integral=0.3)
     assert certify(td3.policy, plant, region=near, transforms=own)
     assert "wrong way" in certify(td3.policy, plant, region=near).reason  # decompose has R > 0
-
-
-def test_a_tanh_at_the_end_leaves_no_floor():
-    """Behind a tanh an unstable plant escapes from far away: nothing is certified everywhere."""
-    plant = plants.LinearPlant([[0.5]], [[1.0]])
-    network = PositiveNetwork(1, slope_min=[2.0, 0.5], slope_max=[3.0, 1.0])
-    assert certify(ModularPolicy(network), plant)
-    assert not certify(ModularPolicy(network, squash=True), plant)
-    s = np.random.default_rng(0).normal(size=(9, 1, 2))
-    policy = ModularPolicy(network, squash=True)
-    with torch.no_grad():
-        wanted = policy(torch.as_tensor(s.reshape(9, 2), dtype=torch.float32)).numpy()
-    np.testing.assert_allclose(action_of(policy, 1)(s, np.ones(1)), wanted, atol=1e-5)

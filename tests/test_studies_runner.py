@@ -70,9 +70,7 @@ JUDGED: list[str] = []
 
 def judge(config: Config, policy: np.ndarray, seeds: int, test: Test) -> dict[str, Any]:
     JUDGED.append(test.name)
-    rows = [
-        {"seed": k, "return": float(v), "number": test.number} for k, v in enumerate(policy[:, 0])
-    ]
+    rows = [{"seed": k, "return": v, "number": test.number} for k, v in enumerate(policy[:, 0])]
     return {"tests": rows, "episodes": [{"seed": 0, "final_mm": 1.0}]}
 
 
@@ -171,16 +169,24 @@ def test_wrong_requests_are_named(whole: Path, tmp_path: Path) -> None:
     for call, message in (
         (lambda: train(TOY, "run", out=tmp_path), "unknown method 'run'; wanted one of walk, fast"),
         (lambda: train(TOY, "walk", [], out=tmp_path), "seeds: wanted at least one"),
+        (lambda: train(TOY, "walk", [0, 0], out=tmp_path), "seeds: .* all different"),
+        (lambda: train(TOY, "walk", out=3), "out: wanted a path, got 3"),
+        (lambda: train("toy", "walk"), "study: wanted a Study, as cmc.studies.get"),
+        (lambda: evaluate(TOY, "walk"), "names: wanted a list of methods, got 'walk'"),
+        (lambda: evaluate(TOY, [], folder=tmp_path), "names: wanted at least one"),
+        (lambda: load(TOY, "still", path=whole), "path: 'still' has fixed gains"),
+        (lambda: summary({}), "tables: wanted rows of `tests`"),
         (lambda: train(TOY, "still", out=tmp_path), "'still' has fixed gains"),
-        (lambda: train(TOY, "walk", length=0, out=tmp_path), "steps: wanted at least 1, got 0"),
-        (lambda: load(TOY, "walk", 31, path=whole), r"step: wanted one of \[30, 60, 90, 100\]"),
+        (lambda: train(TOY, "walk", length=0, out=tmp_path), r"length \(steps\) needs .* got 0"),
+        (
+            lambda: load(TOY, "walk", 31, path=whole),
+            r"mark \(step\): wanted one of \[30, 60, 90, 100\]",
+        ),
         (lambda: load(TOY, "walk", seed=2, path=whole), "seed: wanted a position from 0 to 1"),
         (lambda: load(TOY, "fast", path=whole), "wanted a checkpoint of method 'fast'"),
-        (lambda: evaluate(TOY, trajectories=0), "trajectories: wanted at least 1"),
+        (lambda: evaluate(TOY, ["still"], trajectories=0), "trajectories needs"),
         (lambda: studies.get("toy"), "unknown study 'toy'; wanted one of peg_touch"),
-        (lambda: sweep("peg_touch", ["sac"], [0]), "unknown method 'sac'"),
-        (lambda: sweep("peg_touch", ["cppo"], []), "seeds: wanted at least 1"),
-        (lambda: sweep("peg_touch", ["cppo"], [0], jobs=0), "jobs: wanted at least 1"),
+        (lambda: sweep("peg_touch", ["cppo"], [0], jobs=0), "jobs needs"),
         (lambda: sweep("peg_touch", ["cppo"], [0], backend="mpi"), "wanted 'loky' or 'dask'"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -202,12 +208,10 @@ def test_tests_are_made_once_and_carry_what_they_are_about(whole: Path, tmp_path
     assert nominal[:2] == [(100, 3, True, 100), (100, 5, True, 100)]
     assert nominal[2:] == [(mark, seed, False, 20) for mark in (30, 60, 90) for seed in (3, 5)]
     assert {r["number"] for r in rows if r["test"] == "twice"} == {50}
-    assert [(r["step"], r["seed"]) for r in tables["episodes"] if r["method"] == "walk"] == [
-        (100, 3), (100, 3)
-    ]  # fmt: skip
-    assert [r["reward"] for r in tables["curves"]] == list(
-        store.load_checkpoint(whole)[0]["rewards"].astype(float).ravel()
-    )
+    shown = [(r["step"], r["seed"]) for r in tables["episodes"] if r["method"] == "walk"]
+    assert shown == [(100, 3)] * 2
+    curve = store.load_checkpoint(whole)[0]["rewards"].astype(float).ravel()
+    assert [r["reward"] for r in tables["curves"]] == list(curve)
     assert summary(tables)[0].startswith("Walk: return ")
     few = evaluate(TOY, ["walk"], trajectories=10, **options)["tests"]
     assert {r["number"] for r in few} == {10, 2, 5}
@@ -232,8 +236,12 @@ def test_what_is_shipped_is_the_last_policy_and_rows_of_others_stay(tmp_path: Pa
     after = results.read(table)
     assert after[after["method"] == "walk"].equals(before[before["method"] == "walk"])
     assert set(after.loc[after["method"] == "fast", "seed"]) == {0, 1, 2}
-    with pytest.raises(FileNotFoundError, match="no checkpoint of toy in"):
-        ship(TOY, tmp_path / "empty", assets)
+    (tmp_path / "other").mkdir()
+    store.save_checkpoint(tmp_path / "other" / "x.safetensors", {}, {"study": "x", "method": "y"})
+    for folder, there in (("empty", "empty$"), ("other", "other, .* it holds x$")):
+        for call in (lambda f: ship(TOY, f, assets), lambda f: evaluate(TOY, checkpoints=f)):
+            with pytest.raises(store.CheckpointError, match=f"no checkpoint of toy in .*{there}"):
+                call(tmp_path / folder)
 
 
 def test_groups_of_seeds_put_together_are_the_whole(whole: Path, tmp_path: Path) -> None:
@@ -244,6 +252,8 @@ def test_groups_of_seeds_put_together_are_the_whole(whole: Path, tmp_path: Path)
     other = train(TOY, "walk", [7], length=60, out=tmp_path / "7")
     with pytest.raises(store.CheckpointError, match="other policies are kept"):
         merge([parts[0], other], tmp_path / "x")
+    with pytest.raises(store.CheckpointError, match="paths: wanted different seeds"):
+        merge([parts[0], parts[0]], tmp_path / "x")
 
 
 # -- sweeps ---------------------------------------------------------------------------------------
@@ -265,7 +275,6 @@ def test_a_killed_sweep_leaves_no_process(tmp_path: Path) -> None:
     mark = f"SWEEP_OF_A_TEST={tmp_path.name}".encode()
 
     def of_the_sweep() -> list[Path]:
-        """Processes that carry the mark of this test in their environment."""
         found = []
         for entry in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
@@ -277,7 +286,6 @@ def test_a_killed_sweep_leaves_no_process(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "cmc", *command, "--jobs", "2", "--out", str(tmp_path)],
         env={**os.environ, "SWEEP_OF_A_TEST": tmp_path.name},
-        stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
     deadline = time.monotonic() + 120

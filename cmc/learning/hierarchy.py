@@ -29,21 +29,14 @@ Array = NDArray[np.float64]
 class HierarchyConfig:
     """Rates and sizes of the two levels; our choice where no table is named.
 
-    Attributes:
-        samples: environment steps of a seed between rounds of updates, which are spread evenly over
-            the segments.
-        redraw: probability that an entry of a sub-goal is replaced by a uniform draw, at first and
-            once it has fallen.
-        burst: probability that a world begins `burst_segments` uniform sub-goals in a row, at first
-            and once it has fallen.
-        rate_steps: environment steps of a seed between which the planner's Adam rates fall,
-            linearly, to a tenth, or None if they stay.
-        warm_up: environment steps of a seed with random sub-goals, from which the low level alone
-            learns.
+    Steps are environment steps of a seed. Updates are spread evenly over the segments. An entry of
+    a sub-goal is drawn anew with a probability (`redraw`) that falls linearly from the first to the
+    second value, and with another one (`burst`) a world begins `burst_segments` uniform sub-goals
+    in a row.
     """
 
     worlds: int = 8  # of each seed
-    samples: int = 1024  # `tab:para`
+    samples: int = 1024  # steps between rounds of updates, `tab:para`
     high_updates: int = 100  # of the planner in a round, `tab:para`
     low_updates: int = 100  # of the low level in a round
     low_updates_late: int | None = None  # the same from `low_late` on, or None if they stay
@@ -53,20 +46,18 @@ class HierarchyConfig:
     redraw: tuple[float, float] = (0.0, 0.0)
     burst: tuple[float, float] = (0.0, 0.0)
     burst_segments: int = 3
-    noise_steps: int = 500_000  # steps of a seed until noise, redraws and bursts have fallen
-    rate_steps: tuple[int, int] | None = None
-    warm_up: int = 10_000
+    noise_steps: int = 500_000  # until noise, redraws and bursts have fallen
+    rate_steps: tuple[int, int] | None = None  # between which the planner's rates fall to a tenth
+    warm_up: int = 10_000  # steps with random sub-goals, from which the low level alone learns
     reward_scale: float = 1.0  # factor on the mean reward of a segment
     capacity: int = 65536  # segments that the planner remembers, `tab:para`
 
     def __post_init__(self) -> None:
-        if min(self.worlds, self.samples, self.capacity) < 1:
-            raise ValueError(f"worlds, samples and capacity must be at least 1: {self}")
-        if min(self.high_updates, self.low_updates, self.warm_up) < 0:
-            raise ValueError(f"updates and warm_up must not be negative: {self}")
+        if min(self.worlds, self.samples, self.capacity, self.noise_steps) < 1:
+            raise ValueError(f"worlds, samples, capacity, noise_steps: wanted 1 or more: {self}")
         noise = (self.high_noise, self.high_noise_end or 0.0)
-        if min(noise) < 0 or self.noise_steps < 1:
-            raise ValueError(f"wanted noise of at least 0 and noise_steps of at least 1: {self}")
+        if min(self.high_updates, self.low_updates, self.warm_up, *noise) < 0:
+            raise ValueError(f"updates, warm_up and noise: wanted 0 or more: {self}")
         if not all(0 <= share <= 1 for share in (*self.redraw, *self.burst)):
             raise ValueError(f"redraw and burst: wanted probabilities, got {self}")
         if self.rate_steps is not None and not 0 <= self.rate_steps[0] < self.rate_steps[1]:
@@ -99,14 +90,8 @@ class HierarchyConfig:
 class TwoLevel(Resumable):
     """Trains a planner and a low level on one task, several seeds side by side.
 
-    Args:
-        task: len(seeds) * config.worlds worlds, those of a seed side by side.
-        seeds: one integer for each seed.
-        planner: TD3 on the planner's normalized observations.
-        low: the low level.
-        planning: normalization.
-        config: rates and sizes.
-        relabeller: changes the sub-goals of the planner's samples, or None.
+    The task has len(seeds) * config.worlds worlds, those of a seed side by side; the planner is TD3
+    on observations that `planning` normalizes; `relabeller` may change the sub-goals it samples.
     """
 
     kept = ("steps", "burst", "streams", "planner", "replay", "low", "relabeller")
@@ -147,18 +132,17 @@ class TwoLevel(Resumable):
     def segment(self) -> Array:
         """One sub-goal, its ticks, and the updates that are due; mean rewards (seeds,)."""
         task, planning = self.task, self.planning
-        seen = planning.observe(task, self._obs)
-        middle = planning.direction(task, self._obs)
-        action = self._choose(self._split(seen), self._split(middle) if middle.ndim else middle)
+        seen = self._split(planning.observe(task, self._obs))
+        action = self._choose(seen)
         obs = task.set_subgoal(planning.subgoal(action.reshape(task.num, -1)))
         last: dict[str, Any] = {}
         segment, reward, self._obs, over = rollout(
             task, self.low, obs, self.shape, explore=True, watch=last.update
         )
-        following = planning.observe(task, self._obs)
+        following = self._split(planning.observe(task, self._obs))
         gain = self.config.reward_scale * reward
         # An episode ends by its time limit only: the next value always counts.
-        parts = (self._split(seen), action, gain, self._split(following), np.ones_like(gain))
+        parts = (seen, action, gain, following, np.ones_like(gain))
         self.replay.add(*parts, self.relabeller.pack(segment) if self.relabeller else None)
         self.low.record(segment)
         before = self.steps
@@ -169,11 +153,13 @@ class TwoLevel(Resumable):
             self._obs = task.reset()
         return reward.mean(1)
 
-    def _choose(self, seen: Array, middle: Array) -> Array:
+    def _choose(self, seen: Array) -> Array:
         """The planner's action with noise, or a random one at first; (seeds, worlds, size)."""
         count = (self.config.worlds, len(self.planning.low))
         if self.steps < self.config.warm_up:
+            middle = self.planning.direction(self.task, self._obs)
             drawn = np.stack([g.uniform(-1.0, 1.0, count) for g in self.streams])
+            middle = self._split(middle) if middle.ndim else middle
             return np.clip(middle + drawn, -1.0, 1.0)
         noise, redraw, burst = self.config.exploration(self.steps)
         action = evaluate(self.planner.actor, seen)
@@ -204,6 +190,10 @@ class TwoLevel(Resumable):
         low = self.low.actor
         return {"planner": self.planner.actor} | ({} if low is None else {"low": low})
 
+    def acting(self) -> tuple[nn.Module, LowLevel]:
+        """Planner and low level as they are now."""
+        return self.planner.actor.eval(), self.low
+
     def state(self) -> State:
         """Both levels, memory, physics, random streams."""
         arrays, record = super().state()
@@ -228,19 +218,11 @@ def play(
 ) -> dict[str, Array]:
     """One episode of every world without exploration, and what is kept of every tick.
 
-    Args:
-        task: S * M worlds, those of a seed side by side; its random streams decide the starts.
-        planning: normalization.
-        planner: sub-goals in [-1, 1] from (S, M, size).
-        low: the low level.
-        seeds: how many trained seeds S the networks hold.
-        keep: names out of what `task.step` tells (`reward`, `observation`, `success`,
-            `contact_force`, ...), `distance` to the goal (m), and the worlds' `tip`, `target` (the
-            sub-goal), `qpos` and `force` (3,).
-        ticks: in place of the whole episode, in whole segments.
-
-    Returns:
-        Arrays (T, S, M, ...) by name, taken after each tick.
+    The task has S * M worlds, those of a seed side by side, and its random streams decide the
+    starts; the planner maps (S, M, size) to sub-goals in [-1, 1]; `seeds` is S. `keep` are names of
+    what `task.step` tells (`reward`, `observation`, `success`, `contact_force`, ...), `distance` to
+    the goal (m), and the worlds' `tip`, `target` (the sub-goal), `qpos` and `force` (3,). `ticks`
+    replace the whole episode, in whole segments. Returns arrays (T, S, M, ...) by name.
     """
     kept: dict[str, list[Array]] = {name: [] for name in keep}
     shape = (seeds, task.num // seeds)

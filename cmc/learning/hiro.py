@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from cmc.learning.low_level import CriticLow, Segment
+from cmc.learning.low_level import CriticLow, Segment, tensor
 from cmc.learning.state import Kept
 from cmc.learning.td3 import TD3, Batch
 from cmc.policies import StackedMLP, tanh
@@ -79,7 +79,6 @@ def log_likelihood(
     """How likely the actor acts as recorded, for each sub-goal: -1/2 sum_t |a_t - mu(s_t, g_t)|^2.
 
     The standard deviation is 1 and the constant is left out: neither changes which is largest.
-
     The actor maps (s, velocity, g), (seeds, batch, 3n), to actions (seeds, batch, n). States,
     speeds and actions are (seeds, batch, T, n), the first state where the sub-goal was set; goals
     at t = 0 are (seeds, batch, k, n). Targets s_0 + g are clamped to `reach`, (n,) each. Returns
@@ -108,27 +107,11 @@ class PullActor(nn.Module):
         return tanh(self.net(seen)).abs() * seen[..., -self.n :].sign()
 
 
-class Normalised(nn.Module):
-    """An actor of this module behind its units: takes angles in rad."""
-
-    def __init__(self, actor: nn.Module, units: JointUnits) -> None:
-        super().__init__()
-        self.actor, self.units = actor, units
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """Actions (seeds, batch, n) from (joints, velocity, error)."""
-        seen = self.units.normalise(observation.numpy().astype(np.float64))
-        return self.actor(torch.from_numpy(seen).to(observation.dtype))
-
-
 class JointLow(CriticLow):
-    """TD3 on (joint state, sub-goal); see `CriticLow`.
+    """TD3 on (joint state, sub-goal), both normalised; see `CriticLow`.
 
     Actions are stored as they act, with the sign that the task forces on them, so that likelihoods
-    compare torques.
-
-    `agent` is a `PullActor` with critics on normalised observations; `noise` is the deviation of
-    the exploration noise, in units of the largest torque.
+    compare torques. `noise` is in units of the largest torque.
     """
 
     def __init__(self, agent: TD3, seeds: Sequence[int], units: JointUnits, noise: float) -> None:
@@ -138,7 +121,9 @@ class JointLow(CriticLow):
         self.units = units
 
     def act(self, observation: Array, explore: bool) -> Array:
-        """See `LowLevel.act`; observations are in rad."""
+        """See `LowLevel.act`; observations are in rad, in single precision where it is tested."""
+        if not explore:
+            observation = observation.astype(np.float32).astype(np.float64)
         action = super().act(self.units.normalise(observation), explore)
         return np.abs(action) * np.sign(observation[..., -action.shape[-1] :])
 
@@ -151,11 +136,8 @@ class JointLow(CriticLow):
 class OffPolicyCorrection(Kept):
     """Stores whole segments with the planner's transitions and relabels what is drawn.
 
-    Args:
-        low: the low level whose present policy decides.
-        seeds: one integer for each seed.
-        horizon: ticks T of a segment.
-        stride: ticks between those whose likelihood counts (1: all, as in the source).
+    The present policy of `low` decides. A segment has `horizon` ticks T, and every `stride`-th of
+    them counts (1: all, as in the source).
     """
 
     kept = ("streams",)
@@ -168,7 +150,7 @@ class OffPolicyCorrection(Kept):
         self.n = len(units.start)
         self.size = (3 * horizon + 1) * self.n
         ends = [(end - units.start) / units.half for end in (units.low, units.high)]
-        self._reach = (_tensor(ends[0]), _tensor(ends[1]))
+        self._reach = (tensor(ends[0]), tensor(ends[1]))
         self.streams = [np.random.default_rng([seed, 4, 17]) for seed in seeds]
 
     def pack(self, segment: Segment) -> Array:
@@ -195,7 +177,3 @@ class OffPolicyCorrection(Kept):
         states, speeds, actions = rows[..., :: self.stride, :].chunk(3, dim=-1)
         actor = self.low.agent.actor
         return goals, log_likelihood(actor, states, speeds, actions, goals, self._reach)
-
-
-def _tensor(value: Array) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float32)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from torch import Tensor, nn
 
-from cmc.learning.low_level import LowLevel, Segment
+from cmc.learning.low_level import LowLevel, Segment, tensor
 from cmc.learning.state import Learners
 
 Array = NDArray[np.float64]
@@ -31,9 +31,8 @@ Array = NDArray[np.float64]
 class LatentConfig:
     """Loss and optimizer of the latent rollout (all our choice).
 
-    Attributes:
-        cap: what (K_d + g K2) dt is kept below by construction: below 1 an error does not change
-            sides from tick to tick, which in contact is felt well before chatter starts at 2.
+    (K_d + g K2) dt is kept below `cap` by construction: below 1 an error does not change sides from
+    tick to tick, which in contact is felt well before chatter starts at 2.
     """
 
     rate: float = 2e-3  # Adam's
@@ -76,9 +75,9 @@ class Rollouts:
 
     def __init__(self, model: LatentModel, horizon: int, config: LatentConfig) -> None:
         self.model, self.horizon, self.config = model, horizon, config
-        self._motion, self._push = (_tensor(part) for part in model.transition())
+        self._motion, self._push = (tensor(part) for part in model.transition())
         names = ("K_p", "K1", "K2", "action", "mass", "integrates")
-        self._constants = {name: _tensor(getattr(model, name)) for name in names}
+        self._constants = {name: tensor(getattr(model, name)) for name in names}
 
     def draw(self, generators: Sequence[np.random.Generator], batch: int) -> tuple[Tensor, Tensor]:
         """Axes that are blocked, and constant pushes, (seeds, batch, n) each."""
@@ -91,9 +90,9 @@ class Rollouts:
     def cost(self, actor: nn.Module, starts: Tensor, blocked: Tensor, pushes: Tensor) -> Tensor:
         """Mean cost of rollouts, (seeds,).
 
-        The actor maps (y, integral of y), (seeds, batch, 2n), to actions in [-1, 1]; segments
-        start at (e, e'), (seeds, batch, 2n). By axis, (seeds, batch, n), `blocked` says which
-        cannot move, and `pushes` are constant disturbances in units of an action.
+        The actor maps (y, integral of y) to actions in [-1, 1]; segments start at (e, e'), both
+        (seeds, batch, 2n). By axis, (seeds, batch, n), `blocked` says which cannot move, and
+        `pushes` are constant disturbances in units of an action.
         """
         c, config = self._constants, self.config
         e, v = starts.chunk(2, dim=-1)
@@ -173,7 +172,3 @@ class LatentLow(LowLevel):
     def learners(self) -> Learners:
         """The actor and its Adam."""
         return [(dict(self.actor.named_parameters()), self.adam)]
-
-
-def _tensor(value: Array) -> Tensor:
-    return torch.as_tensor(value, dtype=torch.float32)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from cmc.envs.panda_task import CRITIC, PandaTask
 from cmc.learning.state import Kept, Learners
@@ -22,23 +22,17 @@ from cmc.learning.td3 import TD3, Replay
 from cmc.policies import IndependentNetwork, ModularPolicy, PositiveNetwork, as_numpy
 
 Array = NDArray[np.float64]
-JOINT_STATE = ("joints", "joint_velocity", "joint_error")
-"""Observation fields of a low level that moves joints."""
+CAPACITY = 65536
+"""Ticks that a critic's memory keeps for each seed."""
 
 
 @dataclass(frozen=True)
 class Segment:
-    """The ticks of every world between two sub-goals; T ticks, N worlds of each seed.
+    """The ticks of every world between two sub-goals; T ticks, N worlds of each seed."""
 
-    Attributes:
-        observation: before each tick, and after the last, (T + 1, seeds, N, size).
-        action: (T, seeds, N, n), in [-1, 1].
-        tracking: minus the distances to the sub-goal, by name, (T, seeds, N).
-    """
-
-    observation: Array
-    action: Array
-    tracking: dict[str, Array]
+    observation: Array  # before each tick, and after the last, (T + 1, seeds, N, size)
+    action: Array  # (T, seeds, N, n), in [-1, 1]
+    tracking: dict[str, Array]  # minus the distances to the sub-goal, by name, (T, seeds, N)
 
 
 class LowLevel(Kept):
@@ -68,16 +62,9 @@ class LowLevel(Kept):
 class CriticLow(LowLevel):
     """A low level that learns from a critic, as the paper's does.
 
-    Args:
-        agent: actor and critics.
-        seeds: one integer for each seed.
-        size: how many leading entries of an observation the critics see.
-        noise: standard deviation of the exploration noise.
-        whole_return: whether the critics learn the rest of the segment's return as it came (the
-            segment ends there) instead of one-step targets; the segment's end is terminal in both.
-        weights: what each tracking term counts.
-        n: size of an action.
-        capacity: ticks kept for each seed.
+    Critics see the first `size` entries of an observation, and learn one-step targets, or, with
+    `whole_return`, the rest of the segment's return as it came; the segment's end is terminal in
+    both. `weights` are what each tracking term counts, `noise` is the deviation of the exploration.
     """
 
     kept = ("agent", "replay", "streams")
@@ -92,12 +79,11 @@ class CriticLow(LowLevel):
         whole_return: bool,
         weights: dict[str, float],
         n: int = 6,
-        capacity: int = 65536,
     ) -> None:
         super().__init__(agent.actor, n)
         self.agent, self.size, self.noise = agent, size, noise
         self.whole_return, self.weights = whole_return, weights
-        self.replay = Replay(seeds, size, n, capacity, stream=2)
+        self.replay = Replay(seeds, size, n, CAPACITY, stream=2)
         self.streams = [np.random.default_rng([seed, 2, 17]) for seed in seeds]
 
     def act(self, observation: Array, explore: bool) -> Array:
@@ -120,7 +106,8 @@ class CriticLow(LowLevel):
             continues[:] = 0.0
         seen = segment.observation[..., : self.size]
         parts = (seen[:-1], segment.action, reward, seen[1:], continues)
-        self.replay.add(*(_flat(part) for part in parts))
+        moved = (np.moveaxis(part, 1, 0) for part in parts)
+        self.replay.add(*(part.reshape(len(part), -1, *part.shape[3:]) for part in moved))
 
     def update(self) -> None:
         """One step of the critics, and every other time of the actor."""
@@ -165,7 +152,8 @@ def set_gain(net: PositiveNetwork | IndependentNetwork, gain: ArrayLike) -> None
 
 def low_fields(task: PandaTask) -> tuple[str, ...]:
     """Observation fields that the low level of a task sees."""
-    return JOINT_STATE if task.config.command == "joint" else CRITIC
+    joints = ("joints", "joint_velocity", "joint_error")
+    return joints if task.config.command == "joint" else CRITIC
 
 
 def rollout(
@@ -207,7 +195,6 @@ def evaluate(actor: nn.Module, observation: Array) -> Array:
     return as_numpy(actor)(observation).astype(np.float64)
 
 
-def _flat(part: Array) -> Array:
-    """(T, seeds, N, ...) to (seeds, T N, ...)."""
-    moved = np.moveaxis(part, 1, 0)
-    return moved.reshape(moved.shape[0], -1, *moved.shape[3:])
+def tensor(value: ArrayLike) -> Tensor:
+    """In single precision."""
+    return torch.as_tensor(np.asarray(value), dtype=torch.float32)

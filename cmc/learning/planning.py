@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from cmc.envs.panda_task import PandaTask
-from cmc.learning.low_level import LowLevel, rollout
+from cmc.learning.low_level import LowLevel, rollout, tensor
 from cmc.learning.ppo import PPO, PPOConfig
 
 Array = NDArray[np.float64]
@@ -23,23 +23,14 @@ Array32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Planning:
-    """How a task's observations and sub-goals are normalized for the planner.
+    """How a task's observations and sub-goals are normalized for the planner."""
 
-    Attributes:
-        shift, scale: observation fields of the planner to (field - shift) * scale, by name; fields
-            that are not named stay as they are.
-        low, high: ends of the sub-goal's range, which the planner's [-1, 1] is mapped to.
-        fields: what the planner sees; the task's own `high_level` if None.
-        aim: joint angles around which the random sub-goals of the warm-up lie, (7,), for tasks
-            with joint increments; without it they lie around 0.
-    """
-
-    shift: Mapping[str, Array]
+    shift: Mapping[str, Array]  # fields to (field - shift) * scale, by name; others stay
     scale: Mapping[str, Array]
-    low: Array
+    low: Array  # ends of the sub-goal's range, which the planner's [-1, 1] is mapped to
     high: Array
-    fields: tuple[str, ...] | None = None
-    aim: Array | None = None
+    fields: tuple[str, ...] | None = None  # what the planner sees; the task's own if None
+    aim: Array | None = None  # joints around which the warm-up's sub-goals lie, (7,); 0 if None
 
     def observe(self, task: PandaTask, observation: Array) -> Array:
         """The planner's normalized view of observations (..., size)."""
@@ -65,11 +56,10 @@ class Planning:
 class CriticView:
     """What the planner's critics see: also where tip and sub-goal lie from the goal, in mm.
 
-    A planner's observation brings centimeters to order one, so that half a millimeter is a
-    twentieth of a unit and a tanh layer hardly tells it from zero. The critics alone (they are not
-    needed once the planner is trained) also see tip and asked sub-goal relative to the goal, as
-    they are and through tanh at two scales, and their smoothed lengths n(v, c) = sqrt(v.v + c^2).
-    Sub-goals are positions (3,), m, or poses (6,), m and rad.
+    A planner's observation brings centimeters to order one: a tanh layer hardly tells half a
+    millimeter from zero. The critics alone (not needed once the planner is trained) also see tip
+    and asked sub-goal relative to the goal, as they are and through tanh at two scales, and their
+    smoothed lengths n(v, c) = sqrt(v.v + c^2). Sub-goals are (3,), m, or poses (6,), m and rad.
     """
 
     def __init__(self, task: PandaTask, planning: Planning) -> None:
@@ -81,12 +71,11 @@ class CriticView:
         unit = {k: 1e3 / np.broadcast_to(planning.scale[k], 3) for k in ("position", "goal")}
         middle, half = 0.5 * (planning.low + planning.high), 0.5 * (planning.high - planning.low)
         self._increments = task.config.increments
-        self._mm = {k: _tensor(value) for k, value in unit.items()}
-        self._apart = _tensor(1e3 * (shift["position"] - shift["goal"]))
-        self._middle = _tensor(
-            1e3 * middle[:3] - (0.0 if self._increments else 1e3 * shift["goal"])
-        )
-        self._half, self._turn = _tensor(1e3 * half[:3]), (_tensor(middle[3:]), _tensor(half[3:]))
+        self._mm = {k: tensor(value) for k, value in unit.items()}
+        self._apart = tensor(1e3 * (shift["position"] - shift["goal"]))
+        origin = 0.0 if self._increments else shift["goal"]
+        self._middle = tensor(1e3 * middle[:3] - 1e3 * origin)
+        self._half, self._turn = tensor(1e3 * half[:3]), (tensor(middle[3:]), tensor(half[3:]))
 
     def __call__(self, observation: Tensor, action: Tensor) -> Tensor:
         """Observation, action, and the features of both."""
@@ -107,10 +96,6 @@ class CriticView:
 def _norm(v: Tensor, c: float) -> Tensor:
     """sqrt(v.v + c^2), (..., 1): a length without a kink at zero."""
     return (v.square().sum(-1, keepdim=True) + c * c).sqrt()
-
-
-def _tensor(value: np.ndarray) -> Tensor:
-    return torch.as_tensor(np.asarray(value), dtype=torch.float32)
 
 
 class SegmentEnv(VectorEnv[Array32, Array32, NDArray[Any]]):
@@ -134,25 +119,22 @@ class SegmentEnv(VectorEnv[Array32, Array32, NDArray[Any]]):
         """Start all episodes anew; `seed` is one integer for each equal group of worlds."""
         if seed is not None:
             seeds = np.atleast_1d(seed)
-            if self.num_envs % len(seeds):
-                raise ValueError(
-                    f"wanted seeds that divide {self.num_envs} worlds equally, got {len(seeds)}"
-                )
-            each = self.num_envs // len(seeds)
+            each, rest = divmod(self.num_envs, len(seeds))
+            if rest:
+                wanted = f"seed: wanted integers that divide {self.num_envs} worlds equally"
+                raise ValueError(f"{wanted}, got {len(seeds)}")
             self.task.seed([int(s) + k for s in seeds for k in range(each)])
         return self._seen(self.task.reset()), {}
 
     def step(self, actions: Array32) -> tuple[Array32, Any, Any, Any, dict[str, Any]]:
         """One segment of every world."""
         aim = self.planning.subgoal(np.clip(actions.astype(np.float64), -1.0, 1.0))
-        obs = self.task.set_subgoal(aim)
+        obs, shape = self.task.set_subgoal(aim), (1, self.num_envs)
         last: dict[str, Any] = {}
-        shape = (1, self.num_envs)
         _, reward, obs, over = rollout(self.task, self.idle, obs, shape, False, last.update)
         self.success[:] = last["success"]
-        gain = self.reward_scale * reward[0]
         ended, limit = np.zeros(self.num_envs, bool), np.full(self.num_envs, over)
-        return self._seen(obs), gain, ended, limit, {}
+        return self._seen(obs), self.reward_scale * reward[0], ended, limit, {}
 
     def _seen(self, obs: Array) -> Array32:
         return self.planning.observe(self.task, obs).astype(np.float32)
@@ -167,7 +149,7 @@ class OneLevelPPO(PPO):
         self, env: SegmentEnv, actor: nn.Module, seeds: Sequence[int], config: PPOConfig
     ) -> None:
         super().__init__(env, actor, seeds, config)
-        self.low, self.each = env.idle, env.num_envs // len(seeds)
+        self.each = env.num_envs // len(seeds)
 
     @property
     def stride(self) -> int:
@@ -190,8 +172,12 @@ class OneLevelPPO(PPO):
         if size < 2 * parts:
             raise ValueError(f"wanted two segments for each of {parts} minibatches, got {size}")
         total = self.update()["episode_return"]
-        return np.asarray(total / (self.config.steps * self.env.reward_scale), dtype=np.float64)
+        return np.asarray(total / (self.config.steps * self.env.reward_scale), dtype=float)
 
     def actors(self) -> dict[str, nn.Module]:
         """The network that acts, as "planner"."""
         return {"planner": self.policy}
+
+    def acting(self) -> tuple[nn.Module, LowLevel]:
+        """The planner, and no action below it."""
+        return self.policy.eval(), self.env.idle

@@ -57,14 +57,10 @@ class PPOConfig:
 class PPO(Resumable):
     """Train `policy` on `env` with several seeds at once.
 
-    Args:
-        env: a vector environment of S E trajectories, seed by seed; `reset` takes one integer a
-            seed (a single integer if S = 1). A critic sees `info["privileged"]` where there is one
-            and the observation otherwise.
-        policy: module from observations (S, batch, d) to mean commands (S, batch, n), built with
-            the same seeds.
-        seeds: one non-negative integer for each seed.
-        config: hyperparameters.
+    The vector environment has S E trajectories, seed by seed; its `reset` takes one integer a seed
+    (a single integer if S = 1). A critic sees `info["privileged"]` where there is one and the
+    observation otherwise. The policy maps observations (S, batch, d) to mean commands (S, batch, n)
+    and is built with the same seeds.
     """
 
     kept = ("updates",)
@@ -79,10 +75,8 @@ class PPO(Resumable):
         self.env, self.policy, self.config = env, policy, config or PPOConfig()
         self.seeds = tuple(int(seed) for seed in seeds)
         if not self.seeds or env.num_envs % len(self.seeds):
-            raise ValueError(
-                f"wanted at least one seed, a number that divides {env.num_envs} trajectories; "
-                f"got {len(self.seeds)}"
-            )
+            wanted = f"at least one, a number that divides {env.num_envs} trajectories"
+            raise ValueError(f"seeds: wanted {wanted}; got {len(self.seeds)}")
         first, info = env.reset(seed=self._environment_seeds(0))
         inputs = info.get("privileged", first).shape[-1]
         self.critic = StackedMLP(inputs, 1, self.config.critic_hidden, seeds=self.seeds, last=0.1)

@@ -6,6 +6,7 @@ on from its file ends with the weights, bit for bit, of one that was not.
 
 from __future__ import annotations
 
+import json
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -47,7 +48,11 @@ class Kept:
         arrays: Arrays = {}
         record: dict[str, Any] = {}
         for parameters, adam in self.learners():
-            arrays |= learned(parameters, adam)
+            # as they are: `state_dict` shows those of positive networks by absolute value
+            for name, parameter in parameters.items():
+                arrays[name] = parameter.detach().numpy().copy()
+                for key, moment in adam.state.get(parameter, {}).items() if adam else ():
+                    arrays[f"{name}/{key}"] = moment.numpy().copy()
         for name in self.kept:
             value = getattr(self, name)
             if isinstance(value, Kept):
@@ -61,10 +66,22 @@ class Kept:
                 record[name] = value
         return arrays, record
 
+    @torch.no_grad()
     def restore(self, arrays: Arrays, record: dict[str, Any]) -> None:
-        """Continue from `state`."""
+        """Continue from `state`; a CheckpointError if tensors are missing or of another shape."""
         for parameters, adam in self.learners():
-            relearn(arrays, parameters, adam)
+            for name, parameter in parameters.items():
+                found, shape = arrays.get(name), tuple(parameter.shape)
+                if found is None or found.shape != shape:
+                    came = None if found is None else found.shape
+                    raise store.CheckpointError(f"{name}: wanted shape {shape}, found {came}")
+                parameter.copy_(torch.from_numpy(found))
+                if adam is not None:  # files hold no scalars: a step count has come back as (1,)
+                    moments = under(arrays, f"{name}/").items()
+                    adam.state[parameter] = {
+                        key: torch.tensor(value).reshape(() if key == "step" else shape)
+                        for key, value in moments
+                    }
         for name in self.kept:
             value = getattr(self, name)
             if isinstance(value, Kept):
@@ -90,70 +107,26 @@ class Resumable(Kept):
     config: Any
 
     def save(self, path: str | Path, record: Mapping[str, Any] | None = None) -> None:
-        """Write the state as one safetensors file, atomically.
-
-        `record` holds `study` and `method`, and what else a file must agree with.
-        """
+        """Write the state, and in `record` study, method, and what else a file must agree with."""
         arrays, state = self.state()
-        made = {"study": "none", "method": "none", **(record or {}), "seeds": list(self.seeds)}
-        whole = {**made, "kind": "training", "settings": plain(asdict(self.config)), "state": state}
-        store.save_checkpoint(path, arrays, whole)
+        made = {"study": "none", "method": "none", **self._identity(record)}
+        store.save_checkpoint(path, arrays, {**made, "kind": "training", "state": state})
+
+    def _identity(self, record: Mapping[str, Any] | None) -> dict[str, Any]:
+        """What a file must agree with."""
+        own = {"seeds": list(self.seeds), "settings": asdict(self.config)}
+        return dict(plain({**(record or {}), **own}))
 
     def load(self, path: str | Path, record: Mapping[str, Any] | None = None) -> None:
-        """Go on from a file written by `save`.
-
-        Raises:
-            CheckpointError: if it is damaged, or of another training, seeds, sizes or settings.
-        """
+        """Go on from a file; a CheckpointError if it is damaged or of another training."""
         arrays, found = store.load_checkpoint(path)
         if found.get("kind") != "training":
             raise store.CheckpointError(f"{path} holds no training state")
-        settings = plain(asdict(self.config))
-        wanted = {**plain(record or {}), "seeds": list(self.seeds), "settings": settings}
-        for key, value in wanted.items():
+        for key, value in self._identity(record).items():
             if found.get(key) != value:
-                raise store.CheckpointError(
-                    f"{path}: wanted a training with {key} {value!r}, found {found.get(key)!r}"
-                )
+                said = f"wanted a training with {key} {value!r}, found {found.get(key)!r}"
+                raise store.CheckpointError(f"{path}: {said}")
         self.restore(arrays, found["state"])
-
-
-def learned(parameters: Mapping[str, nn.Parameter], adam: torch.optim.Optimizer | None) -> Arrays:
-    """Weights by name, and Adam's moments by `name/moment`.
-
-    Weights are taken as they are, not through `state_dict`, which shows those of positive networks
-    by absolute value and would lose the sign that Adam's moments belong to.
-    """
-    arrays: Arrays = {}
-    for name, parameter in parameters.items():
-        arrays[name] = parameter.detach().numpy().copy()
-        for key, moment in adam.state.get(parameter, {}).items() if adam else ():
-            arrays[f"{name}/{key}"] = moment.numpy().copy()
-    return arrays
-
-
-@torch.no_grad()
-def relearn(
-    arrays: Mapping[str, np.ndarray],
-    parameters: Mapping[str, nn.Parameter],
-    adam: torch.optim.Optimizer | None,
-) -> None:
-    """Put back what `learned` took, once all of it is found to fit."""
-    for name, parameter in parameters.items():
-        found = arrays.get(name)
-        if found is None or found.shape != tuple(parameter.shape):
-            raise store.CheckpointError(
-                f"wanted a tensor {name!r} of shape {tuple(parameter.shape)}; "
-                f"found {None if found is None else found.shape}"
-            )
-    for name, parameter in parameters.items():
-        parameter.copy_(torch.from_numpy(arrays[name]))
-        if adam is not None:
-            adam.state.pop(parameter, None)
-            for key, value in under(arrays, f"{name}/").items():
-                # files hold no scalars: a step count has come back as (1,)
-                shape = () if key == "step" else parameter.shape
-                adam.state[parameter][key] = torch.tensor(value).reshape(shape)
 
 
 def under(arrays: Mapping[str, np.ndarray], start: str) -> Arrays:
@@ -162,12 +135,9 @@ def under(arrays: Mapping[str, np.ndarray], start: str) -> Arrays:
 
 
 def plain(value: Any) -> Any:
-    """What JSON makes of a value: tuples and arrays become lists."""
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return [plain(item) for item in value] if isinstance(value, (tuple, list)) else value
+    """What JSON makes of a value: tuples and arrays become lists, and classes their names."""
+    text = json.dumps(value, default=lambda x: x.tolist() if hasattr(x, "tolist") else x.__name__)
+    return json.loads(text)
 
 
 @contextmanager

@@ -29,12 +29,8 @@ View = Callable[[Tensor, Tensor], Tensor]
 class TD3Config:
     """Settings of one learner; defaults are the paper's `tab:para` unless marked.
 
-    Attributes:
-        action_gradient_clip: bound on each entry of dQ/da, or None.
-        gradient_clip: bound on the norm of each parameter's gradient, seed by seed, or None.
-        critic_head_start: critic updates before the actor first moves (our choice: 0).
-        pull: weight of the mean square of the actor's values before its last tanh, which keeps
-            them where tanh still has a slope (our choice: 0).
+    `pull` weighs the mean square of the actor's values before its last tanh, which keeps them where
+    tanh still has a slope.
     """
 
     actor_rate: float = 1e-4  # of Adam; the table calls it the target learning rate
@@ -43,14 +39,14 @@ class TD3Config:
     target_rate: float = 0.005  # part of the way that targets move at each target update
     target_period: int = 50  # critic updates between target updates
     actor_period: int = 2  # and between actor updates, TD3's default
-    action_gradient_clip: float | None = None
-    gradient_clip: float | None = None
+    action_gradient_clip: float | None = None  # bound on each entry of dQ/da
+    gradient_clip: float | None = None  # on the norm of each parameter's gradient, seed by seed
     target_noise: float = 0.2  # deviation of the noise on target actions, TD3's default
     target_noise_clip: float = 0.5  # and its bound
     critic_hidden: tuple[int, ...] = (128, 128)  # our choice; the paper's are 400, 300
     batch: int = 128  # transitions of each seed in one update
-    critic_head_start: int = 0
-    pull: float = 0.0
+    critic_head_start: int = 0  # critic updates before the actor first moves (our choice)
+    pull: float = 0.0  # our choice
 
     def __post_init__(self) -> None:
         positive = (self.actor_rate, self.critic_rate, self.target_period, self.actor_period)
@@ -63,14 +59,9 @@ class TD3Config:
 class TD3(Kept):
     """One actor and twin critics for each seed.
 
-    Args:
-        actor: maps observations (seeds, batch, size) to actions in [-1, 1] (seeds, batch, action);
-            with `pull` they are tanh(actor.unsquashed(observation)).
-        seeds: one integer for each seed.
-        observation, action: sizes.
-        config: settings.
-        stream: separates learners that share their seeds (two levels, say).
-        view: what the critics see of observations and actions; both as they are if None.
+    The actor maps observations (seeds, batch, size) to actions in [-1, 1] (seeds, batch, action);
+    with `pull` they are tanh(actor.unsquashed(observation)). `view` is what the critics see of
+    observations and actions; `stream` separates learners that share their seeds.
     """
 
     kept = ("updates", "streams")
@@ -90,15 +81,13 @@ class TD3(Kept):
         self._view = view or (lambda *parts: torch.cat(parts, dim=-1))
         inputs = self._view(torch.zeros(1, 1, observation), torch.zeros(1, 1, action)).shape[-1]
         own = [seed * 1009 + stream for seed in seeds]
-        self.critics = StackedMLP(
-            inputs, 1, config.critic_hidden, copies=2, seeds=own, start="signed"
-        )
+        sizes = (inputs, 1, config.critic_hidden)
+        self.critics = StackedMLP(*sizes, copies=2, seeds=own, start="signed")
         self.target_actor = copy.deepcopy(actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.actor_adam = torch.optim.Adam(actor.parameters(), config.actor_rate, fused=True)
-        self.critic_adam = torch.optim.Adam(
-            self.critics.parameters(), config.critic_rate, fused=True
-        )
+        adam = torch.optim.Adam
+        self.actor_adam = adam(actor.parameters(), config.actor_rate, fused=True)
+        self.critic_adam = adam(self.critics.parameters(), config.critic_rate, fused=True)
         self.updates = 0
         self.streams = [np.random.default_rng([seed, stream, 13]) for seed in seeds]
 
@@ -145,9 +134,8 @@ class TD3(Kept):
         before = actor.unsquashed(seen) if config.pull else None  # type: ignore[operator]
         action = actor(seen) if before is None else tanh(before)
         slope = self._action_gradient(seen, action)
-        clip = config.action_gradient_clip
-        if clip is not None:
-            slope = slope.clamp(-clip, clip)
+        if config.action_gradient_clip is not None:
+            slope = slope.clamp(-config.action_gradient_clip, config.action_gradient_clip)
         loss = -(slope * action).sum() / action.shape[1]
         if before is not None:
             loss = loss + config.pull * before.square().mean((1, 2)).sum()
@@ -178,23 +166,17 @@ class TD3(Kept):
     def _clip(self, module: nn.Module) -> None:
         """Shorten each parameter's gradient to the bound, seed by seed."""
         bound = self.config.gradient_clip
-        if bound is None:
-            return
-        for parameter in module.parameters():
-            if parameter.grad is not None:
-                by_seed = parameter.grad.view(len(self.seeds), -1)
+        for gradient in (p.grad for p in module.parameters() if bound is not None):
+            if gradient is not None:
+                by_seed = gradient.view(len(self.seeds), -1)
                 norm = by_seed.norm(dim=1, keepdim=True)
                 by_seed.mul_((bound / norm.clamp(min=1e-12)).clamp(max=1.0))
 
     def learners(self) -> Learners:
         """Actor and critics, and their targets."""
-        modules = (
-            ("actor", self.actor, self.actor_adam),
-            ("critics", self.critics, self.critic_adam),
-            ("target_actor", self.target_actor, None),
-            ("target_critics", self.target_critics, None),
-        )
-        return [(dict(module.named_parameters(name)), adam) for name, module, adam in modules]
+        adam = {"actor": self.actor_adam, "critics": self.critic_adam}
+        names = ("actor", "critics", "target_actor", "target_critics")
+        return [(dict(getattr(self, k).named_parameters(k)), adam.get(k)) for k in names]
 
 
 @torch.no_grad()
@@ -223,15 +205,9 @@ class Batch:
 class Replay(Kept):
     """The last `capacity` transitions of each seed.
 
-    All seeds are written at the same pace, so one counter serves them all. Each seed draws its
-    samples from its own generator: what one seed learns does not depend on the others.
-
-    Args:
-        seeds: one integer for each seed.
-        observation, action: sizes.
-        capacity: transitions kept for each seed.
-        stream: separates generators that share their seeds (two levels, say).
-        extra: size of what else is stored with a transition.
+    Each seed draws its samples from its own generator: what it learns depends on no other.
+    `observation`, `action` and `extra` (what else is stored) are sizes; `stream` separates
+    generators that share their seeds (two levels, say).
     """
 
     kept = ("written", "streams")
@@ -245,11 +221,9 @@ class Replay(Kept):
         stream: int = 0,
         extra: int = 0,
     ) -> None:
-        if capacity < 1 or observation < 1 or action < 1 or extra < 0 or not seeds:
-            raise ValueError(
-                "wanted seeds and positive sizes; got "
-                f"{len(seeds)} seeds, observation {observation}, action {action}, {capacity} rows"
-            )
+        if min(capacity, observation, action, extra + 1, len(seeds)) < 1:
+            got = f"{len(seeds)} seeds, observation {observation}, action {action}, {capacity} rows"
+            raise ValueError(f"wanted seeds and positive sizes; got {got}")
         self.sizes = (observation, action, 1, observation, 1, extra)
         self.capacity = capacity
         self.rows: Array32 = np.zeros((len(seeds), capacity, sum(self.sizes)), dtype=np.float32)
@@ -275,10 +249,9 @@ class Replay(Kept):
         if extra is not None:
             parts.append(np.asarray(extra, dtype=np.float32))
         new = np.concatenate(parts, axis=-1)
-        if new.shape[0] != len(self.rows) or new.shape[2] != self.rows.shape[2]:
-            raise ValueError(
-                f"wanted rows of {self.sizes} for {len(self.rows)} seeds; got {new.shape}"
-            )
+        if new.shape[::2] != self.rows.shape[::2]:
+            seeds = len(self.rows)
+            raise ValueError(f"wanted rows of {self.sizes} for {seeds} seeds; got {new.shape}")
         where = (self.written + np.arange(new.shape[1])) % self.capacity
         self.rows[:, where] = new
         self.written += new.shape[1]

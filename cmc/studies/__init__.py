@@ -28,7 +28,7 @@ TABLES = ("composition", "low_level", "own_plant", "softness")
 
 def get(name: str) -> Study:
     """The study of this name; a ValueError names the others if there is none."""
-    if name not in WHERE:
+    if not isinstance(name, str) or name not in WHERE:
         raise ValueError(f"unknown study {name!r}; wanted one of {', '.join(WHERE)}")
     module = importlib.import_module(f"cmc.studies.{WHERE[name]}")
     study: Study = module.STUDY if module.STUDY.name == name else module.VARIANTS[name]

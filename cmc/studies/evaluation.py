@@ -15,7 +15,8 @@ import pandas as pd
 from cmc import results, store
 from cmc.learning.state import single_thread
 from cmc.studies.runner import Folder, Progress, find, load, marks_of
-from cmc.studies.study import Rows, Study, Test
+from cmc.studies.study import Rows, Study, Test, checked_methods, checked_study
+from cmc.theory.arrays import count
 
 CURVE = 100
 """Points of a learning curve."""
@@ -35,23 +36,16 @@ def evaluate(
 ) -> Tables:
     """Test trained policies; rows by table, as `cmc.results` describes them.
 
-    Args:
-        study: whose policies.
-        names: methods; all that have a checkpoint or need none if None.
-        trajectories: of each seed in the largest tests, others in proportion; the study's if None.
-        folder: where finished tests are kept and not repeated; by default `runs/STUDY/results`.
-        checkpoints: folder of checkpoint files; the shipped ones if None.
-        progress: called with (tests done, tests in all, what is next).
+    Without `names` all methods are tested that have a checkpoint, in the folder `checkpoints` or
+    shipped, or need none. `trajectories` are those of each seed in the largest tests, others in
+    proportion. Finished tests are kept in `folder` (`runs/STUDY/results`) and not repeated.
+    `progress` is called with (tests done, tests in all, what is next).
+
+    Raises:
+        CheckpointError: if a file is missing, damaged or of another study, or there is none at all.
     """
-    if trajectories is not None and trajectories < 1:
-        raise ValueError(f"trajectories: wanted at least 1, got {trajectories}")
-    files = {
-        name: find(study, name, checkpoints) if study.method(name).trained else None
-        for name in (study.methods if names is None else names)
-    }
-    if names is None:
-        files = {name: file for name, file in files.items() if file is None or file.is_file()}
-    kept = Path(folder) if folder is not None else Path("runs") / study.name / "results"
+    files = _files(study, names, checkpoints)
+    kept = store.as_path("folder", folder or Path("runs") / study.name / "results")
     plans = {name: _plan(study, name, file, trajectories) for name, file in files.items()}
     total, done = sum(len(plan) for plan in plans.values()), 0
     tables: Tables = defaultdict(list)
@@ -79,17 +73,38 @@ def evaluate(
     return dict(tables)
 
 
-def _marks(file: Path | None) -> list[int]:
-    """Kept policies of a file; 0 for fixed gains, which have none."""
-    return [0] if file is None else marks_of(store.load_checkpoint(file)[0])
+def _files(
+    study: Study, names: Iterable[str] | None, checkpoints: Folder
+) -> dict[str, Path | None]:
+    """Checkpoint files of methods, None for fixed gains; without names, of all that have one."""
+    methods = checked_study(study).methods
+    checkpoints = None if checkpoints is None else store.as_path("checkpoints", checkpoints)
+    files = {
+        name: find(study, name, checkpoints) if methods[name].trained else None
+        for name in checked_methods("names", study, methods if names is None else names)
+    }
+    if names is None:
+        files = {name: file for name, file in files.items() if file is None or file.is_file()}
+        if not any(files.values()) and any(method.trained for method in methods.values()):
+            where = f"is shipped: `python -m cmc train {study.name}` makes them"
+            if checkpoints is not None:
+                others = sorted(path.stem for path in checkpoints.glob("*.safetensors"))
+                where = f"in {checkpoints}, wanted its folder; it holds {', '.join(others[:3])}"
+                where = where if others else f"in {checkpoints}"
+            raise store.CheckpointError(f"no checkpoint of {study.name} {where}")
+    if not files:
+        raise ValueError("names: wanted at least one method, got none")
+    return files
 
 
 def _plan(
     study: Study, name: str, file: Path | None, trajectories: int | None
 ) -> list[tuple[Test, int]]:
-    """The tests of a method and the kept policies that they look at."""
-    largest, marks = max(test.number for test in study.tests), _marks(file)
-    share = 1.0 if trajectories is None else trajectories / largest
+    """The tests of a method and the kept policies that they look at; 0 for fixed gains."""
+    largest, marks = max(test.number for test in study.tests), [0]
+    if file is not None:
+        marks = marks_of(store.load_checkpoint(file, study=study.name, method=name)[0])
+    share = 1.0 if trajectories is None else count("trajectories", trajectories) / largest
     return [
         (replace(test, number=max(1, round(share * test.number))), mark)
         for test in study.tests
@@ -100,12 +115,12 @@ def _plan(
 
 def _test(study: Study, name: str, test: Test, mark: int, file: Path | None) -> Tables:
     """Rows of one test of one kept policy, with what they are about in front."""
-    found, marks = load(study, name, mark if file else None, path=file), _marks(file)
+    found = load(study, name, mark if file else None, path=file)
     about: dict[str, Any] = {"method": name, "title": study.method(name).title}
-    about |= {"test": test.name, study.unit: mark, "last": mark == marks[-1]}
+    about |= {"test": test.name, study.unit: mark, "last": mark == found.marks[-1]}
     config = test.change(study.config_of(name))
     tables = study.judge(config, found.policy, len(found.seeds), test)
-    shown = set(tables) if mark in study.shown(marks) else {"tests", "certificates"}
+    shown = set(tables) if mark in study.shown(found.marks) else {"tests", "certificates"}
 
     def plain(row: dict[str, Any]) -> dict[str, Any]:
         """Plain numbers, without those that are missing; the seed in place of its position."""
@@ -133,16 +148,15 @@ def _curve(study: Study, name: str, file: Path) -> Rows:
 
 def summary(tables: Tables) -> list[str]:
     """A line for each method about its last policies in the nominal test: means over seeds."""
+    if not (isinstance(tables, dict) and tables.get("tests")):
+        raise ValueError("tables: wanted rows of `tests`, as `evaluate` answers")
     data = results.at(pd.DataFrame(tables["tests"]))
-    shares = ("success", "touched", "oscillation", "drift")
-    keys = [key for key in (*shares, "error_f", "return", "largest_N") if key in data]
-    lines: dict[str, list[str]] = defaultdict(list)
-    for key in keys:
-        found = (results.share if key in shares else results.spread)(data, key, "title")
-        unit = " %" if key in shares else ""
-        for title, row in found.iterrows():
+    shares, lines = ("success", "touched", "oscillation", "drift"), defaultdict(list)
+    for key in (*shares, "error_f", "return", "largest_N"):
+        made, unit = (results.share, " %") if key in shares else (results.spread, "")
+        for title, row in made(data, key, "title").iterrows() if key in data else ():
             ends = f"[{row['low']:.3g}, {row['high']:.3g}]"
-            lines[str(title)].append(f"{key} {row['mean']:.4g}{unit} {ends}")
+            lines[title].append(f"{key} {row['mean']:.4g}{unit} {ends}")
     return [f"{title}: {', '.join(parts)}" for title, parts in lines.items()]
 
 
@@ -158,38 +172,32 @@ def ship(
 
     The last policy of each method goes to `assets/checkpoints`, bit by bit, with the run's record
     beside it as JSON; of methods in `complete` all kept policies go. Their rows replace those of
-    the same method in `assets/results`. Finished tests are kept in `FOLDER/results`.
-
-    Returns:
-        The files written.
+    the same method in `assets/results`. Finished tests are kept in `FOLDER/results`. Returns the
+    files written.
     """
-    for name in complete:
-        study.method(name)
-    fixed = [name for name, method in study.methods.items() if not method.trained]
-    there = {name: find(study, name, folder) for name in study.methods if name not in fixed}
-    files = {name: file for name, file in there.items() if file.is_file()}
-    if there and not files:
-        raise FileNotFoundError(f"no checkpoint of {study.name} in {folder}")
-    names, kept = [*files, *fixed], Path(folder) / "results"
-    tables = evaluate(study, names, folder=kept, checkpoints=folder, progress=progress)
-    written, seeds = [], [0]
+    complete = checked_methods("complete", study, complete)
+    folder, target = store.as_path("folder", folder), store.as_path("assets", assets)
+    files = _files(study, None, folder)
+    options: Any = {"folder": folder / "results", "checkpoints": folder, "progress": progress}
+    tables, written, seeds = evaluate(study, files, **options), [], [0]
     for name, file in files.items():
+        if file is None:
+            continue
         tensors, record = store.load_checkpoint(file, study=study.name, method=name)
         earlier = () if name in complete else marks_of(tensors)[:-1]
         unwanted = tuple(f"{mark:08d}." for mark in earlier)
         chosen = {key: value for key, value in tensors.items() if not key.startswith(unwanted)}
-        target = Path(assets) / "checkpoints" / file.name
-        written.append(store.save_checkpoint(target, chosen, record))
-        store.write_json(target.with_suffix(".json"), record)
+        path = target / "checkpoints" / file.name
+        written.append(store.save_checkpoint(path, chosen, record))
+        store.write_json(path.with_suffix(".json"), record)
         seeds = max(seeds, record["seeds"], key=len)
     made = store.provenance(f"python -m cmc ship {study.name} FOLDER", seeds)
     for table, rows in tables.items():
-        target = Path(assets) / "results" / results.file_name(study.name, table)
-        new = pd.DataFrame(rows)
-        if target.is_file():
-            old = results.read(target)
-            new = pd.concat([old[~old["method"].isin(names)], new], ignore_index=True)
+        path, new = target / "results" / results.file_name(study.name, table), pd.DataFrame(rows)
+        if path.is_file():
+            old = results.read(path)
+            new = pd.concat([old[~old["method"].isin(list(files))], new], ignore_index=True)
         order = {name: k for k, name in enumerate(study.methods)}
         new = new.sort_values("method", key=lambda m: m.map(order), kind="stable")
-        written.append(results.write(target.parent, table, new, {"study": study.name, **made}))
+        written.append(results.write(path.parent, table, new, {"study": study.name, **made}))
     return written

@@ -11,9 +11,10 @@ from torch import Tensor, nn
 from cmc import store
 from cmc.robot.panda import scene_spec
 from cmc.studies.runner import find, load, marks_of
-from cmc.studies.study import Study
+from cmc.studies.study import Study, checked_methods, checked_study
 from cmc.studies.two_level import start_joints
 from cmc.studies.two_level_tests import TEST_SEED
+from cmc.theory.arrays import count
 
 CHOICE = ("ctd3", "frozen", "td3_corrected", "control")
 """Methods that a live page offers beside those it was asked for."""
@@ -21,18 +22,24 @@ CHOICE = ("ctd3", "frozen", "td3_corrected", "control")
 
 def playable(study: Study, first: Sequence[str] = ()) -> list[str]:
     """The methods `first`, then the shipped ones of `CHOICE`; a ValueError without an arm."""
-    if not hasattr(study.config, "task_class"):
-        raise ValueError(f"{study.name} has no arm to play live; wanted peg_maze or peg_push")
+    first = checked_methods("first", _arm(study), first)
     rest = [name for name in CHOICE if name in study.methods and find(study, name).is_file()]
     return list(dict.fromkeys([*first, *rest]))
 
 
+def _arm(study: Study) -> Study:
+    """A study with an arm, or a ValueError."""
+    if not hasattr(checked_study(study).config, "task_class"):
+        raise ValueError(f"{study.name} has no arm to play live; wanted peg_maze or peg_push")
+    return study
+
+
 def live_task(study: Study, starts: int = 5) -> dict[str, Any]:
     """Scene, control law, limits and test starts of a study's task; SI units throughout."""
-    c, latent = study.config.task, study.config.task.gains.latent
+    c, latent = _arm(study).config.task, study.config.task.gains.latent
     spec = scene_spec(c.scene, c.peg, c.timestep)
     spec.compile()
-    task = study.config.make(starts)
+    task = study.config.make(count("starts", starts))
     task.seed([TEST_SEED + k for k in range(starts)])
     obs = task.reset()
     goals, planning = obs[:, task.layout["goal"]], study.config.planning()
@@ -70,12 +77,12 @@ def live_task(study: Study, starts: int = 5) -> dict[str, Any]:
 def live_policies(study: Study, methods: Sequence[str]) -> list[dict[str, Any]]:
     """Planner and low level of every shipped policy and seed of methods, as nested lists."""
     found = []
-    for name in methods:
+    for name in checked_methods("methods", _arm(study), methods):
         if study.config_of(name).task.command != "pose":
             raise ValueError(f"{name} moves joints; a live page plays methods that move the tip")
         kept = []
         for mark in marks_of(store.load_checkpoint(find(study, name))[0]):
-            (planner, low), step, seeds = load(study, name, mark)
+            (planner, low), step, seeds, _ = load(study, name, mark)
             policies = [
                 {"planner": _layers(planner.network.mlp, k, 1)[0], "low": _low(low.actor, k)}
                 for k in range(len(seeds))

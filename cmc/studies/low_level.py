@@ -30,7 +30,7 @@ from cmc.learning.latent import LatentConfig, LatentLow, LatentModel, Rollouts
 from cmc.learning.state import single_thread
 from cmc.studies.peg_push import STUDY
 from cmc.studies.study import Array
-from cmc.studies.two_level_arms import capped_actor
+from cmc.studies.two_level import capped_actor
 
 UPDATES, TUNED, JUDGED = 300, 128, 1024
 """Learning steps; segments that gains are searched on, and that all are judged on."""

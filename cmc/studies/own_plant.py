@@ -138,19 +138,13 @@ def certified(action: Any) -> float:
 
 
 BOUNDS: dict[str, Any] = {"hidden": (16, 16), "slope_min": FLOOR, "slope_max": CAP}
+free = lambda: DirectPolicy(JointNetwork(2, inputs=4, seeds=SEEDS))  # noqa: E731
+convex = lambda: ModularPolicy(ConvexGradientNetwork(2, seeds=SEEDS))  # noqa: E731
 METHODS: dict[str, tuple[str, type[PPO] | None, Callable[[], nn.Module]]] = {
-    "ppo": ("PPO", PPO, lambda: DirectPolicy(JointNetwork(2, inputs=4, seeds=SEEDS))),
-    "penalty": (
-        "PPO with a Jacobian penalty",
-        PenalisedPPO,
-        lambda: DirectPolicy(JointNetwork(2, inputs=4, seeds=SEEDS)),
-    ),
+    "ppo": ("PPO", PPO, free),
+    "penalty": ("PPO with a Jacobian penalty", PenalisedPPO, free),
     "cppo": ("C-PPO", PPO, lambda: ModularPolicy(PositiveNetwork(2, seeds=SEEDS, **BOUNDS))),
-    "convex": (
-        "convex-gradient PI",
-        PPO,
-        lambda: ModularPolicy(ConvexGradientNetwork(2, seeds=SEEDS)),
-    ),
+    "convex": ("convex-gradient PI", PPO, convex),
     "lqr": ("LQR", None, LQR),
 }
 """Title, learner, and the policy of all seeds side by side."""

@@ -35,15 +35,13 @@ from cmc.learning.hierarchy import HierarchyConfig
 from cmc.learning.latent import LatentConfig
 from cmc.learning.td3 import TD3Config
 from cmc.studies.study import Study, Test, before_last, last
-from cmc.studies.two_level import TwoLevelConfig, light
-from cmc.studies.two_level_arms import HIRO, METHODS
+from cmc.studies.two_level import HIRO, METHODS, TwoLevelConfig, light
 from cmc.studies.two_level_tests import judge, motion
 
 _CENTER = (0.415, -0.0225, 0.005)
 _INVERSE_HALF = (1 / 0.015, 1 / 0.0075, 1 / 0.01)
 
 TESTS = (Test("nominal", 20, when=before_last), Test("nominal", 100, when=last))
-"""Policies kept on the way are tested by fewer episodes."""
 
 STUDY = Study(
     name="peg_maze",

@@ -23,15 +23,12 @@ What the paper gives is in `cmc.envs.peg_push` and in the table `tab:para`. Devi
    differed, is in `peg_push_again`.
 
 The contact of the simulator is soft; how much of the result it owes to that is tested too. MuJoCo
-(its documentation, chapter Modeling, section "Solver parameters") resolves a contact of depth r by
-the reference acceleration a = -b v - k r with
+(documentation, "Solver parameters") resolves a contact of depth r by a = -b v - k r with
 
-    b = 2 / (d_max T),    k = d(r) / (d_max^2 T^2 zeta^2),
+    b = 2 / (d_max T),    k = d(r) / (d_max^2 T^2 zeta^2),    solref = (T, zeta).
 
-where solref = (T, zeta) are a time constant and a damping ratio, and solimp sets the impedance d.
 Appendix H has T = 10 ms and zeta = 1. Tests "contact x c" multiply T of every shape that can touch
-by c, while zeta, d and all else stay: k goes with 1 / c^2, b with 1 / c. Studies
-`peg_push_contact_xC` train under such contact.
+by c: k goes with 1 / c^2, b with 1 / c. Studies `peg_push_contact_xC` train under such contact.
 """
 
 from __future__ import annotations
@@ -40,7 +37,6 @@ from dataclasses import replace
 from functools import cache
 
 import mujoco
-import numpy as np
 
 from cmc.envs.peg_push import PUSH, TARGET, PegPush
 from cmc.learning.hierarchy import HierarchyConfig
@@ -48,9 +44,9 @@ from cmc.learning.ppo import PPOConfig
 from cmc.learning.td3 import TD3Config
 from cmc.studies.peg_maze import TESTS
 from cmc.studies.study import Study, Test, changed, last
-from cmc.studies.two_level import TwoLevelConfig, light
-from cmc.studies.two_level_arms import METHODS
+from cmc.studies.two_level import METHODS, TwoLevelConfig, light
 from cmc.studies.two_level_tests import judge, motion
+from cmc.theory.arrays import number
 
 TIME_CONSTANT = 0.01
 """Of contact in the scene, s."""
@@ -62,12 +58,10 @@ CONTACT = ("ctd3", "frozen", "td3")
 def scaled(scale: float) -> type[PegPush]:
     """Peg push with the time constant of all contact multiplied by `scale`.
 
-    Raises:
-        ValueError: if the time constant falls below two physics steps, the shortest that MuJoCo
-            accepts (it silently raises shorter ones).
+    MuJoCo silently raises time constants below two physics steps: they are refused.
     """
     shortest = 2 * PUSH.timestep
-    if not (np.isfinite(scale) and scale * TIME_CONSTANT >= shortest * (1 - 1e-9)):
+    if number("scale", scale) * TIME_CONSTANT < shortest * (1 - 1e-9):
         raise ValueError(
             f"scale: {scale} makes the time constant {1e3 * scale * TIME_CONSTANT:g} ms, wanted at "
             f"least two physics steps, {1e3 * shortest:g} ms"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,9 +13,11 @@ from torch import Tensor, nn
 
 from cmc.envs.peg_touch import PegTouchVectorEnv
 from cmc.envs.peg_touch_config import PegShift, PegTouchConfig
-from cmc.policies import ModularPolicy
-from cmc.studies.peg_touch_arms import signed
-from cmc.studies.study import Array, Rows
+from cmc.plants import Lags
+from cmc.policies import ConvexGradientNetwork, ModularPolicy
+from cmc.studies.study import Array, Rows, Test, same
+from cmc.theory.arrays import checked, number
+from cmc.theory.certify import certify
 from cmc.theory.sampled import sampled_margin
 
 Flags = NDArray[np.bool_]
@@ -50,6 +53,14 @@ tail's second half over that of its first."""
 # -- one test -----------------------------------------------------------------
 
 
+def judge(config: Any, policy: nn.Module, seeds: int, test: Test) -> dict[str, Rows]:
+    """One test of one policy, and what its weights guarantee."""
+    found = measure(policy, config.task, test.number, seeds)
+    if test.change is same and signed(policy):
+        found["certificates"] = certificates(policy, config.task, config.slope_limit())
+    return found
+
+
 def measure(policy: nn.Module, task: PegTouchConfig, number: int, seeds: int) -> dict[str, Rows]:
     """Test a policy on (seeds, number, 4) inputs; the columns of `cmc.results`.
 
@@ -59,8 +70,7 @@ def measure(policy: nn.Module, task: PegTouchConfig, number: int, seeds: int) ->
     run = record(policy, task, number, seeds)
     flags = {name: f.reshape(seeds, number) for name, f in detect(run.tail, task.h).items()}
     size = np.abs(run.tail).mean(axis=0, dtype=np.float64).reshape(seeds, number, 2)
-    found: dict[str, Array] = {"return": run.returns.mean(axis=1)}
-    found |= {name: flag.mean(axis=1) for name, flag in flags.items()}
+    found = {"return": run.returns.mean(axis=1)} | {k: f.mean(axis=1) for k, f in flags.items()}
     found["error_x"], found["error_f"] = np.median(size, axis=1).T
     found["error_f_90"] = np.quantile(size[..., 1], 0.9, axis=1)
     more: dict[str, Any] = {"trajectories": number, "h": task.h}
@@ -84,22 +94,13 @@ def measure(policy: nn.Module, task: PegTouchConfig, number: int, seeds: int) ->
 
 
 class Recording(NamedTuple):
-    """What one test leaves.
+    """What one test leaves of S seeds and M trajectories each."""
 
-    Attributes:
-        tail: errors in the judged window, (time, seeds * trajectories, 2), m and N.
-        mean_s: mean of the policy's input over that window, (seeds, trajectories, 2, 2).
-        returns: sum of rewards over the first `horizon` steps, (seeds, trajectories).
-        wrong_sign: share of visited states with a negative slope in [signal, integral], (seeds, 2);
-            None without slopes.
-        envs: the environment after the last step.
-    """
-
-    tail: NDArray[np.float32]
-    mean_s: Array
-    returns: Array
-    wrong_sign: Array | None
-    envs: PegTouchVectorEnv
+    tail: NDArray[np.float32]  # errors in the judged window, (time, S M, 2), m and N
+    mean_s: Array  # mean of the policy's input over that window, (S, M, 2, 2)
+    returns: Array  # sum of rewards over the first `horizon` steps, (S, M)
+    wrong_sign: Array | None  # share of visited states with a negative [signal, integral], (S, 2)
+    envs: PegTouchVectorEnv  # after the last step
 
 
 def record(policy: nn.Module, task: PegTouchConfig, num: int, seeds: int = 1) -> Recording:
@@ -141,24 +142,18 @@ def detect(error: ArrayLike, h: float) -> dict[str, Flags]:
 
     A trajectory has a flag if one of its signals has; oscillation goes before drift before offset.
 
-    Args:
-        error: tracking errors, (time, batch, 2), m and N, sampled every `h` seconds.
-        h: sample time, s.
-
-    Returns:
-        The flags, (batch,) each; at most one is set.
-
-    Raises:
-        ValueError: if the record is shorter than the window or of another shape, or not finite.
+    Takes tracking errors (time, batch, 2), m and N, sampled every `h` seconds; returns the flags,
+    (batch,) each, of which at most one is set. A ValueError says if the record is shorter than the
+    window, of another shape, or not finite.
     """
     e = np.asarray(error)
-    e = e if e.dtype == np.float32 else e.astype(np.float64)
-    if e.ndim != 3 or e.shape[-1] != len(THRESHOLD):
+    e = e if e.dtype == np.float32 else checked("error", error)
+    if e.ndim != 3 or e.shape[-1] != len(THRESHOLD) or not e.size:
         raise ValueError(f"error: wanted (time, batch, {len(THRESHOLD)}), got {e.shape}")
-    count = round(WINDOW / h)
+    count = round(WINDOW / number("h", h, above=0))
     if count < 8 or len(e) < count:
         raise ValueError(
-            f"error: wanted at least 8 samples in a window of {WINDOW} s and a record no "
+            f"error, h: wanted at least 8 samples in a window of {WINDOW} s and a record no "
             f"shorter than it; got {len(e)} samples every {h} s"
         )
     tail, half = e[-count:], count // 2
@@ -184,11 +179,9 @@ def detect(error: ArrayLike, h: float) -> dict[str, Flags]:
 def equilibrium(policy: nn.Module, envs: PegTouchVectorEnv, seeds: int) -> tuple[Tensor, Flags]:
     """The input (0, I*) at which a contracting policy holds the targets, by bisection.
 
-    pi_i(0, I) grows with I, so I* solves u0 - pi(0, I*) = (x_d, f_d / K + g(x_d)).
-
-    Returns:
-        The input (seeds, trajectories, 2, 2), and whether an equilibrium exists, (..., 2): tanh
-        networks saturate, and some targets need more command than they can give.
+    pi_i(0, I) grows with I, so I* solves u0 - pi(0, I*) = (x_d, f_d / K + g(x_d)). Returns the
+    input (seeds, trajectories, 2, 2), and whether an equilibrium exists, (..., 2): tanh networks
+    saturate, and some targets need more command than they can give.
     """
     c, x_d = envs.config, envs.sampled["x_d"]
     wanted = np.stack([x_d, envs.true_peg.height(x_d, envs.sampled["f_d"])], axis=-1)
@@ -230,11 +223,67 @@ def predicted_oscillation(policy: nn.Module, s: Tensor, envs: PegTouchVectorEnv)
     return np.any(sampled_margin(k1, k2, tau, K, c.h) < 0, axis=-1)
 
 
+# -- what the weights guarantee -------------------------------------------------------------------
+
+
+def signed(policy: nn.Module) -> bool:
+    """Whether the weights guarantee the sign of every slope, each dimension on its own."""
+    network = getattr(policy, "network", None)
+    return hasattr(network, "slope_bounds") and not isinstance(network, ConvexGradientNetwork)
+
+
+def certificates(policy: nn.Module, task: PegTouchConfig, limit: Array) -> Rows:
+    """What holds for each seed of a policy, from its weights alone.
+
+    In contact and in the coordinates (x, z) the peg is two separate lags with gains 1 and K,
+    exactly; the surface only couples the first into the second. Each loop can be judged alone.
+
+    Rows have `seed` (position) and, for all states: `signs`: every slope has the right sign, so
+    each linearization is a stable continuous loop (the paper's condition). `slope_x`, `slope_z`:
+    k1 + (h/2) k2, bounded by the product of the weights. `stiffest`: stiffness up to which the
+    sampled loop of every linearization is stable at the nominal lags, N/m; `stiffness_factor`: the
+    same over the stiffest of the training set; `x_margin`: the same for the horizontal loop, as a
+    factor on its gain. `design`: whether the slopes stay below `limit` (2,), the largest for the
+    worst plant of the design. `contracting`, `rate`: whether one quadratic metric proves
+    contraction for all slopes that the weights allow, sampled, on the softest and the stiffest
+    surface of the training set; `reason`: why not.
+    """
+    lower, upper = (b.reshape(-1, 2, 2) for b in policy.slope_bounds())  # type: ignore[operator]
+    steepest = upper[..., 0] + 0.5 * task.h * upper[..., 1]
+    tau, reference = np.array([task.tau_x, task.tau_z]), task.stiffness_reference
+    margin = 1.0 / np.tanh(task.h / (2.0 * tau)) / steepest
+    # a cap on the loop gain allows any nominal stiffness: what counts is the factor on it
+    gains = task.K_sur if reference is None else [reference]
+    rows = []
+    for k, bounds in enumerate(zip(lower, upper, strict=True)):
+        own = SimpleNamespace(slope_bounds=lambda bounds=bounds: bounds)
+        plants = [Lags(tau=tuple(tau), gain=(1.0, gain)) for gain in gains]
+        found = [certify(own, plant, h=task.h) for plant in plants]
+        rows.append(
+            {
+                "seed": k,
+                "signs": bool((bounds[0] >= 0.0).all()),
+                "slope_x": steepest[k, 0],
+                "slope_z": steepest[k, 1],
+                "stiffest": margin[k, 1] if reference is None else None,
+                "stiffness_factor": margin[k, 1] / gains[-1],
+                "x_margin": margin[k, 0],
+                "design": bool((steepest[k] < limit).all()),
+                "contracting": all(part.holds for part in found),
+                "rate": min((part.rate for part in found if part.holds), default=None),
+                "reason": next((part.reason for part in found if not part.holds), ""),
+            }
+        )
+    return rows
+
+
+# -- one episode as arrays ------------------------------------------------------------------------
+
+
 def motion(config: Any, policy: nn.Module, episode: int) -> dict[str, Any]:
     """Errors of 50 trajectories of the training set for 1 s, from a random stream of this number.
 
-    Returns:
-        `t` (time,), `signals` (label, errors by time and trajectory, target), and `text`.
+    `t` (time,), `signals` (label, errors by time and trajectory, target), and `text`.
     """
     envs, errors = PegTouchVectorEnv(50, config.task, AutoresetMode.DISABLED), []
     obs, _ = envs.reset(seed=episode)

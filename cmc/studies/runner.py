@@ -1,4 +1,4 @@
-"""Train a study's methods, load what they learned, test it, and ship it.
+"""Train a study's methods, and load what they learned.
 
 A run is a folder. `STUDY_METHOD.safetensors` holds the kept policies (tensors `MARK.PART.NAME`) and
 the learning curve, `METHOD_state.safetensors` the whole state of the training. Both are written at
@@ -8,7 +8,6 @@ there to the same end, bit for bit.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -19,14 +18,17 @@ import numpy as np
 import torch
 
 from cmc import store
-from cmc.learning.state import interruptions, single_thread
-from cmc.studies.study import Study
+from cmc.learning.state import interruptions, plain, single_thread
+from cmc.studies.study import Study, checked_seeds, checked_study
+from cmc.theory.arrays import count, refuse_uncallable
 
 Callback = Callable[[dict[str, Any]], object]
 Progress = Callable[[int, int, str], object]
 Folder = str | Path | None
 SAVE_EVERY = 60.0
 """Longest time between two savings of a training, s."""
+MOST = 10**9
+"""Steps or episodes of a training."""
 
 
 # -- training -------------------------------------------------------------------------------------
@@ -43,34 +45,29 @@ def train(
 ) -> Path:
     """Train a method and keep its policies; a run that was stopped goes on where it was.
 
-    Args:
-        study: what is trained.
-        name: one of its methods.
-        seeds: one training for each, all in one batch of networks.
-        length: steps or episodes of each seed, in place of the study's.
-        out: folder of the run, by default `runs/STUDY`.
-        callback: called after every segment with `done`, `total`, `gain` (seeds,) and, where the
-            training knows it, `success` (seeds,), the share of the latest finished episodes.
-
-    Returns:
-        The checkpoint file with all kept policies, which `load` reads.
+    All seeds are trained in one batch of networks, for `length` steps or episodes each (the study's
+    if None), in the folder `out` (`runs/STUDY`). `callback` is called after every segment with
+    `done`, `total`, `gain` (seeds,) and, where the training knows it, `success` (seeds,), the share
+    of the latest finished episodes. Returns the file with all kept policies, which `load` reads.
 
     Raises:
         CheckpointError: if the folder holds a run of other seeds or another configuration.
         KeyboardInterrupt: on SIGINT and SIGTERM, once everything is saved.
     """
-    total = study.length if length is None else length
-    if total < 1:
-        raise ValueError(f"{study.unit}s: wanted at least 1, got {total}")
-    if not study.method(name).trained:
+    method = checked_study(study).method(name)
+    total = count(f"length ({study.unit}s)", study.length if length is None else length, MOST)
+    refuse_uncallable("callback", callback or print)
+    if not method.trained:
         raise ValueError(f"{name!r} has fixed gains: there is nothing to train")
-    training = study.build(name, list(seeds))
-    folder = Path(out) if out is not None else Path("runs") / study.name
-    packed = folder / f"{study.name}_{name}.safetensors"
-    state = folder / f"{name}_state.safetensors"
+    seeds = checked_seeds(seeds)
+    folder = store.as_path("out", Path("runs") / study.name if out is None else out)
+    packed, state = (
+        folder / f"{study.name}_{name}.safetensors",
+        folder / f"{name}_state.safetensors",
+    )
     record = _record(study, name, seeds, total)
     identity = {key: record[key] for key in ("study", "method", "configuration")}
-    kept, curve = _resumed(packed, state, record)
+    training, (kept, curve) = study.build(name, seeds), _resumed(packed, state, record)
     if curve:
         training.load(state, identity)
         del curve[training.steps // training.stride :]
@@ -111,18 +108,19 @@ def _resumed(
     if not packed.is_file():
         return {}, []  # a state without its policies belongs to nothing: the run starts afresh
     kept, found = store.load_checkpoint(packed, study=record["study"], method=record["method"])
-    advice = "use another folder (--out), or move it away"
-    if found.get("seeds") != record["seeds"]:
-        what = f"seeds {found.get('seeds')}, not {record['seeds']}"
-        raise store.CheckpointError(f"{packed} is a run of {what}: {advice}")
-    if found.get("configuration") != record["configuration"]:
-        raise store.CheckpointError(f"{packed} is a run of another configuration: {advice}")
-    curve = [row for key in ("rewards", "returns") for row in kept.pop(key, ())]
-    if not state.is_file():
-        raise store.CheckpointError(
-            f"{packed} has lost its {state.name}, so it ends here: {advice}"
-        )
-    return kept, curve
+    advice, own = "use another folder (--out), or move it away", found.get("seeds")
+    if own != record["seeds"]:
+        if isinstance(own, list) and own == list(range(len(own))):
+            advice = f"go on with it by --seeds {len(own)}, {advice}"
+        said = f"is a run of seeds {own}, not {record['seeds']}"
+    elif found.get("configuration") != record["configuration"]:
+        said = "is a run of another configuration"
+    elif not state.is_file():
+        said = f"has lost its {state.name}, so it ends here"
+    else:
+        curve = [row for key in ("rewards", "returns") for row in kept.pop(key, ())]
+        return kept, curve
+    raise store.CheckpointError(f"{packed} {said}: {advice}")
 
 
 def _mark(study: Study, done: int, stride: int, total: int) -> int | None:
@@ -143,15 +141,10 @@ def _weights(training: Any, mark: int) -> dict[str, np.ndarray]:
 
 
 def _record(study: Study, name: str, seeds: Sequence[int], total: int) -> dict[str, Any]:
-    """The record of a run; its configuration as JSON gives it back."""
+    """The record of a run."""
     command = f"python -m cmc train {study.name} --method {name} --seeds {len(seeds)}"
-    made = store.provenance(f"{command} --{study.unit}s {total}", [int(seed) for seed in seeds])
-
-    def other(value: Any) -> Any:
-        return value.tolist() if isinstance(value, np.ndarray) else value.__name__
-
-    settings = {"every": study.every, **asdict(study.config_of(name))}
-    settings = json.loads(json.dumps(settings, default=other))
+    made = store.provenance(f"{command} --{study.unit}s {total}", list(seeds))
+    settings = plain({"every": study.every, **asdict(study.config_of(name))})
     return {"study": study.name, "method": name, "configuration": settings, **made}
 
 
@@ -159,17 +152,12 @@ def _record(study: Study, name: str, seeds: Sequence[int], total: int) -> dict[s
 
 
 class Loaded(NamedTuple):
-    """A kept policy of all seeds, or of one.
+    """A kept policy of all seeds, or of one."""
 
-    Attributes:
-        policy: as the study's tests take it, with a leading axis of seeds.
-        mark: its step or episode; 0 for fixed gains.
-        seeds: the trainings.
-    """
-
-    policy: Any
-    mark: int
-    seeds: list[int]
+    policy: Any  # as the study's tests take it, with a leading axis of seeds
+    mark: int  # its step or episode; 0 for fixed gains
+    seeds: list[int]  # the trainings
+    marks: list[int]  # of all policies that are kept
 
 
 def load(
@@ -182,45 +170,40 @@ def load(
 ) -> Loaded:
     """A trained policy; fixed gains need no file.
 
-    Args:
-        study: of the policy.
-        name: method.
-        mark: step or episode of a kept policy; the last one if None.
-        seed: position of one seed, for a leading axis of one; None for all seeds.
-        path: checkpoint file; the shipped one if None.
+    `mark` is the step or episode of a kept policy (the last one if None), `seed` the position of
+    one seed, for a leading axis of one (all seeds if None), `path` a checkpoint file in place of
+    the shipped one.
     """
+    file = find(study, name) if path is None else store.as_path("path", path)
     light = replace(study, config=study.light(study.config))
     if not study.method(name).trained:
-        return Loaded(light.build(name, [0]).acting(), 0, [0])
-    file = find(study, name) if path is None else Path(path)
+        if path is not None:
+            raise ValueError(f"path: {name!r} has fixed gains and no checkpoint, got {path}")
+        return Loaded(light.build(name, [0]).acting(), 0, [0], [0])
     tensors, record = store.load_checkpoint(file, study=study.name, method=name)
     found, seeds = marks_of(tensors), record.get("seeds")
     if not (found and isinstance(seeds, list) and seeds):
         raise store.CheckpointError(f"{file}: wanted kept policies and seeds, found none")
     mark = found[-1] if mark is None else mark
     if mark not in found:
-        raise ValueError(f"{study.unit}: wanted one of {found}, got {mark}")
-    if seed is not None and not 0 <= seed < len(seeds):
+        raise ValueError(f"mark ({study.unit}): wanted one of {found}, got {mark}")
+    if seed is not None and (isinstance(seed, bool) or seed not in range(len(seeds))):
         raise ValueError(f"seed: wanted a position from 0 to {len(seeds) - 1}, got {seed}")
     chosen = seeds if seed is None else [seeds[seed]]
     training = light.build(name, chosen)
     for part, module in training.actors().items():
-        start, own = f"{mark:08d}.{part}.", module.state_dict()
-        kept = {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}
-        if lacking := set(own) - set(kept):
-            raise store.CheckpointError(f"{file}: lacks tensors {sorted(lacking)} of {start}")
         state = {}
-        for key, wanted in own.items():
-            value, shape = kept[key], tuple(wanted.shape)
-            if seed is not None and value.size == len(seeds) * wanted.numel():
+        for key, wanted in module.state_dict().items():
+            value, shape = tensors.get(f"{mark:08d}.{part}.{key}"), tuple(wanted.shape)
+            if value is not None and seed is not None and value.size == len(seeds) * wanted.numel():
                 value = value.reshape(len(seeds), *shape)[seed]
-            if value.shape != shape:
-                said = f"wanted {shape}, got {value.shape}"
-                raise store.CheckpointError(f"{file}: shape of {key}: {said}")
+            if value is None or value.shape != shape:
+                came = "none" if value is None else value.shape
+                raise store.CheckpointError(f"{file}: shape of {key}: wanted {shape}, got {came}")
             state[key] = torch.from_numpy(value)
         module.load_state_dict(state)
         module.eval()
-    return Loaded(training.acting(), mark, chosen)
+    return Loaded(training.acting(), mark, chosen, found)
 
 
 def marks_of(tensors: Mapping[str, Any]) -> list[int]:
@@ -230,10 +213,10 @@ def marks_of(tensors: Mapping[str, Any]) -> list[int]:
 
 def find(study: Study, name: str, checkpoints: Folder = None) -> Path:
     """Checkpoint file of a method: in the folder, else the shipped one, else that of `runs`."""
-    study.method(name)
+    checked_study(study).method(name)
     file = f"{study.name}_{name}.safetensors"
     if checkpoints is not None:
-        return Path(checkpoints) / file
+        return store.as_path("checkpoints", checkpoints) / file
     try:
         return store.asset("checkpoints", file)
     except FileNotFoundError:

@@ -27,7 +27,7 @@ from cmc.envs.panda_task import PandaTask
 from cmc.envs.peg_maze import SOFT, STIFF, PegMaze
 from cmc.envs.vector import Array
 from cmc.envs.worlds import PandaTaskConfig
-from cmc.robot.panda import Peg
+from cmc.studies.study import changed
 
 SLOPE = 20.0 * np.array([1.0] * 3 + [0.1] * 3)
 """Of the fixed low level at zero, du/dy, our choice."""
@@ -105,38 +105,30 @@ def wander(config: PandaTaskConfig, worlds: int, ticks: int) -> dict[str, float]
         peaks.append(info["contact_force_max"])
         if len(peaks) % config.ticks == 0:
             task.reset()
-    found = {}
+    found = {"force_999_N": float(np.quantile(peaks, 0.999)), "largest_N": float(np.max(peaks))}
     for end, force in (("_50hz", np.array(now)), ("", np.array(peaks))):
         found[f"no_contact{end}"] = float((force == 0).mean())
         found[f"below_1_N{end}"] = float((force < 1).mean())
-    most = {"force_999_N": float(np.quantile(peaks, 0.999)), "largest_N": float(np.max(peaks))}
-    return found | most
+    return found
 
 
-def _peg(stiffness: float, damping: float = 8.0, mass: float = 0.03) -> Peg:
-    return Peg(length=0.05, stiffness=stiffness, damping=damping, mass=mass)
-
-
-def _u(*translation: float) -> tuple[float, ...]:
-    return (*translation, 1.0, 1.0, 1.0)
-
-
+soft = lambda **changes: changed(**changes)(SOFT)  # noqa: E731
 CONFIGS = {
     "stiff": STIFF,
     "soft": SOFT,
     "spring alone": replace(STIFF, peg=SOFT.peg),
     "limits alone": replace(SOFT, peg=STIFF.peg),
-    "spring 50 N/m": replace(SOFT, peg=_peg(50.0, 4.0)),
-    **{f"spring {k} N/m": replace(SOFT, peg=_peg(float(k))) for k in (100, 200, 400)},
-    **{f"damping {d} N s/m": replace(SOFT, peg=_peg(150.0, float(d))) for d in (2, 16)},
-    "peg of 10 g": replace(SOFT, peg=_peg(150.0, mass=0.01)),
-    "error limit 3 mm": replace(SOFT, law=replace(SOFT.law, error_limit=0.003)),
-    "error limit 4 mm": replace(SOFT, law=replace(SOFT.law, error_limit=0.004)),
-    "action 0.15 m/s^2": replace(SOFT, u_limit=_u(0.15, 0.15, 0.15)),
-    "action 0.25 m/s^2": replace(SOFT, u_limit=_u(0.25, 0.25, 0.25)),
-    "action scaled by 1/m_eff": replace(SOFT, u_limit=_u(0.3, 0.15, 0.1)),
-    "one 6x6 block": replace(SOFT, law=replace(SOFT.law, split=False)),
-    "control at every physics step": replace(SOFT, hold=False),
+    "spring 50 N/m": soft(peg={"stiffness": 50.0, "damping": 4.0}),
+    **{f"spring {k} N/m": soft(peg={"stiffness": float(k)}) for k in (100, 200, 400)},
+    **{f"damping {d} N s/m": soft(peg={"damping": float(d)}) for d in (2, 16)},
+    "peg of 10 g": soft(peg={"mass": 0.01}),
+    "error limit 3 mm": soft(law={"error_limit": 0.003}),
+    "error limit 4 mm": soft(law={"error_limit": 0.004}),
+    "action 0.15 m/s^2": soft(u_limit=(0.15, 0.15, 0.15, 1.0, 1.0, 1.0)),
+    "action 0.25 m/s^2": soft(u_limit=(0.25, 0.25, 0.25, 1.0, 1.0, 1.0)),
+    "action scaled by 1/m_eff": soft(u_limit=(0.3, 0.15, 0.1, 1.0, 1.0, 1.0)),
+    "one 6x6 block": soft(law={"split": False}),
+    "control at every physics step": soft(hold=False),
 }
 """The regimes, the ingredients of the soft one, and what else was tried."""
 

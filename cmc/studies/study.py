@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from functools import reduce
+from operator import index
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -49,7 +50,7 @@ def changed(**changes: Any) -> Change:
     def adapt(config: Any) -> Any:
         new: dict[str, Any] = {}
         for name, value in changes.items():
-            old: Any = getattr(config, name)
+            old: Any = getattr(config, name, None)  # `replace` refuses a field that is not there
             partial = is_dataclass(old) and isinstance(value, Mapping)
             new[name] = replace(old, **value) if partial else value
         return replace(config, **new)
@@ -64,40 +65,25 @@ def both(*steps: Change) -> Change:
 
 @dataclass(frozen=True)
 class Method:
-    """One arm of a study.
+    """One arm of a study."""
 
-    Attributes:
-        title: in figures and tables.
-        build: its untrained training, from the configuration and the seeds.
-        adapt: the study's configuration to the method's own.
-        trained: False for fixed gains.
-    """
-
-    title: str
-    build: Callable[[Any, Sequence[int]], Training]
-    adapt: Change = same
-    trained: bool = True
+    title: str  # in figures and tables
+    build: Callable[[Any, Sequence[int]], Training]  # from its configuration and the seeds
+    adapt: Change = same  # the study's configuration to the method's own
+    trained: bool = True  # False for fixed gains
 
 
 @dataclass(frozen=True)
 class Test:
-    """One condition under which kept policies are tested.
-
-    Attributes:
-        name: in tables; several tests of other policies may share it.
-        number: episodes of each seed.
-        change: the method's configuration to that of the test.
-        when: which of the kept policies are tested, from their steps in rising order.
-        methods: names; all if None.
-    """
+    """One condition under which kept policies are tested."""
 
     __test__ = False  # not a pytest class
 
-    name: str
-    number: int
-    change: Change = same
-    when: Callable[[Sequence[int]], Iterable[int]] = same
-    methods: tuple[str, ...] | None = None
+    name: str  # in tables; several tests of other policies may share it
+    number: int  # episodes of each seed
+    change: Change = same  # the method's configuration to that of the test
+    when: Callable[[Sequence[int]], Iterable[int]] = same  # which of the kept policies' steps
+    methods: tuple[str, ...] | None = None  # names; all if None
 
 
 def last(marks: Sequence[int]) -> Sequence[int]:
@@ -114,41 +100,28 @@ def before_last(marks: Sequence[int]) -> Sequence[int]:
 class Study:
     """Methods, the configuration that they share, and how they are tested.
 
-    Attributes:
-        name: of the study, its files and its folder.
-        about: one line.
-        config: a frozen dataclass that everything in a run depends on.
-        methods: by name.
-        tests: what `evaluate` does.
-        length: of a training, of each seed.
-        every: how far apart policies are kept.
-        judge: one test of one policy: (config, policy, seeds, test) to rows by table; `seed` is a
-            position in a row.
-        motion: one episode as arrays, for `play`: (config, policy of one seed, number of the start)
-            to `text` and what the picture needs.
-        light: a configuration that builds faster and acts the same, for loading.
-        shown: of which kept policies tables other than `tests` are kept.
-        unit: what `length` counts, and the name of its column in tables.
-        gain: what a training's curve shows, and the name of its column.
+    `judge` makes one test of one policy: (config, policy, seeds, test) to rows by table, in which
+    `seed` is a position. `motion` records one episode for `play`: (config, policy of one seed,
+    number of the start) to `text` and what the picture needs.
     """
 
-    name: str
-    about: str
-    config: Any
+    name: str  # of the study, its files and its folder
+    about: str  # one line
+    config: Any  # a frozen dataclass that everything in a run depends on
     methods: Mapping[str, Method]
     tests: tuple[Test, ...]
-    length: int
-    every: int
+    length: int  # of a training, of each seed
+    every: int  # how far apart policies are kept
     judge: Callable[[Any, Any, int, Test], dict[str, Rows]]
     motion: Callable[[Any, Any, int], dict[str, Any]]
-    light: Change = same
-    shown: Callable[[Sequence[int]], Iterable[int]] = last
-    unit: Literal["step", "episode"] = "step"
-    gain: Literal["reward", "return"] = "reward"
+    light: Change = same  # a configuration that builds faster and acts the same, for loading
+    shown: Callable[[Sequence[int]], Iterable[int]] = last  # whose tables but `tests` are kept
+    unit: Literal["step", "episode"] = "step"  # what `length` counts, and its column in tables
+    gain: Literal["reward", "return"] = "reward"  # what a training's curve shows, and its column
 
     def method(self, name: str) -> Method:
         """The method of this name; a ValueError names the others if there is none."""
-        if name not in self.methods:
+        if not isinstance(name, str) or name not in self.methods:
             raise ValueError(f"unknown method {name!r}; wanted one of {', '.join(self.methods)}")
         return self.methods[name]
 
@@ -158,10 +131,37 @@ class Study:
 
     def build(self, name: str, seeds: Sequence[int]) -> Training:
         """A method's training, not yet begun."""
-        if len(seeds) == 0:
-            raise ValueError("seeds: wanted at least one, got none")
-        return self.method(name).build(self.config_of(name), seeds)
+        return self.method(name).build(self.config_of(name), checked_seeds(seeds))
 
     def variant(self, name: str, about: str, **changes: Any) -> Study:
         """This study under another name, with its configuration `changed`."""
         return replace(self, name=name, about=about, config=changed(**changes)(self.config))
+
+
+def checked_study(study: Any) -> Study:
+    """A study, or a ValueError that says how to get one."""
+    if not isinstance(study, Study):
+        raise ValueError(f"study: wanted a Study, as cmc.studies.get(name) is, got {study!r}")
+    return study
+
+
+def checked_methods(name: str, study: Study, methods: Any) -> list[str]:
+    """Names of a study's methods, or a ValueError."""
+    if isinstance(methods, str) or not isinstance(methods, Iterable):
+        raise ValueError(f"{name}: wanted a list of methods, got {methods!r}")
+    found = list(methods)
+    for method in found:
+        checked_study(study).method(method)
+    return found
+
+
+def checked_seeds(seeds: Any) -> list[int]:
+    """Different integers from 0, at least one, or a ValueError."""
+    try:
+        given = list(seeds)
+        found = [index(seed) for seed in given if not isinstance(seed, bool)]
+    except TypeError:
+        found = given = []
+    if not found or min(found) < 0 or len(set(found)) < len(given):
+        raise ValueError(f"seeds: wanted at least one integer from 0, all different, got {seeds!r}")
+    return found

@@ -23,6 +23,8 @@ import numpy as np
 
 from cmc import store, studies
 from cmc.studies import runner
+from cmc.studies.study import checked_methods, checked_seeds
+from cmc.theory.arrays import count
 
 
 def sweep(
@@ -43,29 +45,27 @@ def sweep(
     time: by "loky" in processes of this machine, by "dask" (extra `cmc[cluster]`) at the `address`
     of a scheduler or in a cluster of `jobs` processes made for it. `length` and `out` are those of
     `runner.train`.
-
-    Raises:
-        ValueError: for an unknown study, method or backend, no seed, or less than one job.
     """
-    for name in names:
-        studies.get(study).method(name)
-    size = len(seeds) if group is None else group
-    for what, number in (("seeds", len(seeds)), ("jobs", jobs), ("group", size)):
-        if number < 1:
-            raise ValueError(f"{what}: wanted at least 1, got {number}")
+    names = checked_methods("names", studies.get(study), names)
+    if not names:
+        raise ValueError("names: wanted at least one method, got none")
+    seeds = checked_seeds(seeds)
+    size = count("group", len(seeds) if group is None else group)
     if backend not in ("loky", "dask"):
         raise ValueError(f"backend: wanted 'loky' or 'dask', got {backend!r}")
+    if length is not None:
+        length = count("length", length, runner.MOST)
     from joblib import Parallel, delayed, parallel_config
 
-    folder = Path(out) if out is not None else Path("runs") / study
-    parts = [list(seeds[k : k + size]) for k in range(0, len(seeds), size)]
+    folder = store.as_path("out", Path("runs") / study if out is None else out)
+    parts = [seeds[k : k + size] for k in range(0, len(seeds), size)]
     parent = None if address is not None else os.getpid()
     calls = []
     for name in names:
         for part in parts:
             own = folder / "parts" / f"{name}_{part[0]}-{part[-1]}" if len(parts) > 1 else folder
             calls.append(delayed(_train)(study, name, part, str(own), length, parent))
-    jobs = min(jobs, len(calls))
+    jobs = min(count("jobs", jobs), len(calls))
     cluster = _cluster(jobs, address) if backend == "dask" else nullcontext()
     with cluster, parallel_config(backend=backend):
         made = [Path(p) for p in Parallel(n_jobs=jobs, batch_size=1, verbose=5)(calls)]
@@ -111,11 +111,9 @@ def _cluster(jobs: int, address: str | None) -> Iterator[None]:
 
 
 def merge(paths: Sequence[Path], out: Path) -> Path:
-    """Put checkpoints of the same method and different seeds together.
-
-    Raises:
-        CheckpointError: if they are of different studies, methods, configurations or lengths.
-    """
+    """Put checkpoints of the same method and different seeds together, or say what differs."""
+    if not isinstance(paths, Sequence) or not paths:
+        raise ValueError(f"paths: wanted checkpoint files, got {paths!r}")
     loaded = [store.load_checkpoint(path) for path in paths]
     tensors, record = loaded[0]
     for path, (others, found) in zip(paths, loaded, strict=True):
@@ -130,6 +128,8 @@ def merge(paths: Sequence[Path], out: Path) -> Path:
         for key in tensors
     }
     seeds = [seed for _, found in loaded for seed in found["seeds"]]
-    group = f"--seeds {len(seeds)} --group {len(record['seeds'])}"
-    command = re.sub(r"--seeds \d+", group, str(record.get("command", "")))
+    if len(set(seeds)) < len(seeds):
+        raise store.CheckpointError(f"paths: wanted different seeds, got {seeds}")
+    command = f"--seeds {len(seeds)} --group {len(record['seeds'])}"
+    command = re.sub(r"--seeds \d+", command, str(record.get("command", "")))
     return store.save_checkpoint(out, joined, {**record, "seeds": seeds, "command": command})

@@ -14,8 +14,8 @@ from cmc.learning.low_level import LowLevel, low_fields
 from cmc.policies import PositiveNetwork
 from cmc.robot.panda import FINGERTIP, JOINTS, inverse_kinematics
 from cmc.studies.study import Array, Rows, Test, same
-from cmc.studies.two_level import TwoLevelConfig
-from cmc.studies.two_level_arms import N, Policy
+from cmc.studies.two_level import N, Policy, TwoLevelConfig
+from cmc.theory.arrays import count
 
 TEST_SEED = 900_000  # test worlds never share a stream with training
 PUSH = 2.0
@@ -46,6 +46,8 @@ def judge(config: TwoLevelConfig, policy: Policy, seeds: int, test: Test) -> dic
 
 def figures(found: Mapping[str, Array]) -> Rows:
     """Figures of each seed's test episodes from `KEPT` of every tick, (T, S, M); S seeds."""
+    if not isinstance(found, Mapping) or not set(KEPT) <= set(found):
+        raise ValueError(f"found: wanted arrays of {', '.join(KEPT)} by name")
     distance, deepest = found["distance"], found["penetration"].max(0)
     success, touched = found["success"][-1] > 0, (found["success"] > 0).any(0)
     columns: dict[str, Array] = {
@@ -78,21 +80,30 @@ def _gains(config: TwoLevelConfig, low: LowLevel, seeds: int, k: int) -> dict[st
     actor = getattr(low, "actor", None)
     if config.task.command == "joint" or actor is None:
         return {}
-    net, slopes = getattr(actor, "network", None), slope_at_rest(config, low, seeds)[k]
-    found = {f"slope_{axis}": float(slopes[i]) for i, axis in enumerate(AXES)}
+    net, columns = getattr(actor, "network", None), {"slope": slope_at_rest(config, low, seeds)[k]}
     if isinstance(net, PositiveNetwork) and net.joint is not None:
-        cap = config.slope_cap()
-        found |= {f"cap_{axis}": float(cap[i]) for i, axis in enumerate(AXES)}
-    return found
+        columns["cap"] = config.slope_cap()
+    return {
+        f"{key}_{axis}": float(v[i]) for key, v in columns.items() for i, axis in enumerate(AXES)
+    }
 
 
-def slope_at_rest(config: TwoLevelConfig, low: LowLevel, seeds: int, eps: float = 1e-4) -> Array:
+def _asked(config: TwoLevelConfig, low: LowLevel, seeds: int) -> None:
+    """The door for what a low level is tested with."""
+    for name, value, kind in (("config", config, TwoLevelConfig), ("low", low, LowLevel)):
+        if not isinstance(value, kind):
+            raise ValueError(f"{name}: wanted a {kind.__name__}, got {value!r}")
+    count("seeds", seeds)
+
+
+def slope_at_rest(config: TwoLevelConfig, low: LowLevel, seeds: int) -> Array:
     """Slope du/dy at rest of every dimension, (seeds, 6), by a central difference."""
+    _asked(config, low, seeds)
     if config.task.command == "joint":
         raise ValueError("slopes in y: wanted a low level of the tip, got one of the joints")
     if low.actor is None:
         return np.zeros((seeds, N))
-    seen, index = np.zeros((seeds, 2 * N, 4 * N + 1)), np.arange(N)
+    seen, index, eps = np.zeros((seeds, 2 * N, 4 * N + 1)), np.arange(N), 1e-4
     seen[:, index, index], seen[:, N + index, index] = eps, -eps
     u = low.act(seen, explore=False)
     return (u[:, index, index] - u[:, N + index, index]) / (2 * eps)
@@ -106,25 +117,24 @@ def consistency(
 ) -> dict[str, Array]:
     """Spread of the tip's displacement over one segment for one sub-goal, over starts and pushes.
 
-    In free space (the task without its obstacles) every world starts an episode anew, is moved by a
-    random sub-goal for one segment, so that it starts the next one elsewhere and in motion, and is
-    then asked for a step of 5 mm along -x. Afterwards it goes back to where that step began and
-    does it again while a force of `PUSH` newtons acts on the tip, in a direction drawn for each
-    start uniformly on the sphere and fixed for the segment. Starts and pushes are the same for all
-    seeds and methods. Sub-goals are not clamped here, so that the step is 5 mm everywhere.
+    In free space every world is moved by a random sub-goal for one segment, so that it starts the
+    next one elsewhere and in motion, and is then asked for a step of 5 mm along -x. It goes back to
+    where that step began and does it again while a force of `PUSH` newtons acts on the tip, in a
+    direction drawn for each start uniformly on the sphere and fixed for the segment. Starts and
+    pushes are the same for all seeds and methods; no sub-goal is clamped.
 
-    Returns:
-        Over starts, by seed, (seeds,) each, m: `moved_mm`, the mean displacement along the step,
-        and `moved_x_mm`, ... in x, y, z; `starts_mm`, the root of the summed variances of the
-        displacement; `push_mm`, the root mean square distance between the ends of the segment with
-        the push and without it from the same start. (Names are those of the columns, in mm.)
+    Returns, by seed (seeds,) and in m (names are those of the columns, in mm): `moved_mm`, the mean
+    displacement along the step, and `moved_x_mm`, ... in x, y, z; `starts_mm`, the root of the
+    summed variances of the displacement over starts; `push_mm`, the root mean square distance
+    between the segment's ends with the push and without it.
     """
+    _asked(config, low, seeds)
     bounds: dict[str, Any] = {}  # none that would shorten a step near the edge
     for name in ("subgoal", "workspace"):
         size = len(getattr(config.task, f"{name}_low"))
         bounds |= {f"{name}_low": (-1.0,) * size, f"{name}_high": (1.0,) * size}
     free = replace(config, task=replace(config.task, scene="panda.xml", **bounds))
-    task, rng = free.make(seeds * starts), np.random.default_rng(TEST_SEED)
+    task, rng = free.make(seeds * count("starts", starts)), np.random.default_rng(TEST_SEED)
     task.seed([TEST_SEED + 1 + k for k in range(starts)] * seeds)
     task.reset()
     ends = np.array(config.task.subgoal_low), np.array(config.task.subgoal_high)
@@ -184,10 +194,9 @@ def _segment(
 def motion(config: TwoLevelConfig, policy: Policy, episode: int) -> dict[str, Any]:
     """One test episode of one seed, recorded.
 
-    Returns:
-        `model` (MuJoCo), `t` (T + 1,), `qpos` (T + 1, nq), `tip` (T + 1, 3), `force` (T + 1, 3),
-        N, on the peg, `distance` (T + 1,) to the goal, m, `markers` (name to (3,) or (T + 1, 3)),
-        `success` at the end and `touched` at any tick, and `text`.
+    `model` (MuJoCo), `t` (T + 1,), `qpos` (T + 1, nq), `tip` (T + 1, 3), `force` (T + 1, 3), N, on
+    the peg, `distance` (T + 1,) to the goal, m, `markers` (name to (3,) or (T + 1, 3)),
+    `success` and `touched` (at the end, at any tick), and `text`.
     """
     task, start = config.make(1), config.make(1)
     for each in (task, start):
