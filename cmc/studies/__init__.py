@@ -18,7 +18,6 @@ WHERE = {
     "peg_maze_paper_sizes": "peg_maze",
     "peg_push": "peg_push",
     "peg_push_contact_x0.4": "peg_push",
-    "peg_push_contact_x4": "peg_push",
 }
 """Names, and the module of this package whose `STUDY`, or whose `VARIANTS`, holds the study."""
 
