@@ -271,3 +271,31 @@ def test_long_questions_report_their_progress():
     assert lines[0] == "round 1: one metric for 40 of 64 vertices"
     with pytest.raises(TypeError, match="progress"):
         certify(policy(n=3), plant, progress="yes")
+
+
+def test_a_policy_on_another_device_is_brought_to_the_cpu():
+    pytest.importorskip("torch")
+    from cmc.policies import ModularPolicy, PositiveNetwork
+
+    class Elsewhere(ModularPolicy):
+        here = False
+
+        def cpu(self):
+            self.here = True
+            return super().cpu()
+
+        def __getattribute__(self, name):
+            if name in ("network", "R", "u0", "slope_bounds") and not self.here:
+                raise TypeError("can't convert cuda:0 device type tensor to numpy")
+            return super().__getattribute__(name)
+
+        def __init__(self, network):
+            self.__dict__["here"] = True
+            super().__init__(network)
+            self.here = False
+
+    away = Elsewhere(PositiveNetwork(2, hidden=(8,), slope_min=0.5, slope_max=1.0))
+    assert certify(away, plants.get("coupled_lags"))
+    assert not away.here
+    box = Region([-0.2, -0.2], [0.2, 0.2], integral=0.2, points=3)
+    assert not certify(away, plants.get("pendulum"), region=box).refused

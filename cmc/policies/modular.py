@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from itertools import chain
 from typing import Any
@@ -170,6 +171,8 @@ def as_numpy(policy: nn.Module) -> Function:
     observation that is not finite. Stacked tanh networks run in numpy, which for the few rows of a
     control step costs a fifth of a call into torch; any other policy runs in torch.
     """
+    if any(part.device.type != "cpu" for part in chain(policy.parameters(), policy.buffers())):
+        policy = copy.deepcopy(policy).cpu()
     dtype = torch.empty(0, dtype=_dtype(policy)).numpy().dtype
     run = _in_numpy(policy) or _in_torch(policy)
 

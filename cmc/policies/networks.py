@@ -120,8 +120,8 @@ class PositiveNetwork(SignalNetwork):
         The lower end of an uncapped, bypass-free network is 0 and is only approached.
         """
         with torch.no_grad():
-            low = self.slope_min.double().numpy()
-            high = _product([weight.double() for weight in self.used_weights()]).numpy()
+            low = self.slope_min.double().cpu().numpy()
+            high = _product([weight.double() for weight in self.used_weights()]).cpu().numpy()
         high = high.reshape(*([self.seeds] if self.seeds else []), self.n, 2) + low
         return np.broadcast_to(low, high.shape).copy(), high
 
@@ -150,7 +150,7 @@ class LinearNetwork(nn.Module):
 
     def slope_bounds(self) -> tuple[Array, Array]:
         """The gains are both bounds, ([seeds,] n, 2) each."""
-        gains = np.tile(self.gains.double().numpy(), (self.seeds, 1, 1) if self.seeds else 1)
+        gains = np.tile(self.gains.double().cpu().numpy(), (self.seeds, 1, 1) if self.seeds else 1)
         return gains, gains.copy()
 
 

@@ -137,7 +137,7 @@ class ConvexGradientNetwork(nn.Module):
     def slope_bounds(self) -> tuple[Array, Array]:
         """Guaranteed interval of the diagonal slopes d pi_i / d s_ij, ([seeds,] n, 2) each."""
         with torch.no_grad():
-            W, a = self.W.double(), self.a.abs().double()
+            W, a = self.W.double().cpu(), self.a.abs().double().cpu()
             high = (a * W * W).sum(-1).reshape(-1, 2, self.n).transpose(1, 2).numpy() + self.mu
         high = high[0] if self.seeds is None else high
         return np.full_like(high, self.mu), high

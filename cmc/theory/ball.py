@@ -140,7 +140,7 @@ def lowest(
     is lowered less by all clouds that could follow: that much is left as a margin.
     """
     rng, values, smallest = np.random.default_rng(0), value(points), []
-    for k in range(8):
+    for k in range(5):
         smallest.append(values.min())
         near = points[np.argsort(values)[:32]]
         cloud = near + rng.normal(size=(8, *near.shape)) * width / 2**k

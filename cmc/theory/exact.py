@@ -105,10 +105,11 @@ def certify_exact(
 ) -> Certificate:
     """Exact certificate of one policy over a box of (y, int z); arguments as in `certify`.
 
-    One metric is sought for the total Jacobians at 1024 points or so, then tried at 2048 others and
-    downhill from the worst of all (`lowest`); what fails joins the vertices, a few rounds at most.
-    The rate is that of the worst point, less the margin that the descent leaves and what rounding
-    may hide. The metric is in (y, int z), or in y alone where the policy does not use int z.
+    One metric is sought for the total Jacobians at some 3000 points, moved away from their mean by
+    the share that 2048 others lie beyond them, then tried downhill from the worst (`lowest`); what
+    fails joins them, a few rounds at most. The rate is that of the worst, less the margin that the
+    descent leaves and what rounding may hide. The metric is in (y, int z), or in y alone where the
+    policy does not use int z.
     """
     domain = "continuous" if h is None else "sampled"
     where = f"{region}, |int z| at most {np.asarray(region.integral).tolist()}"
@@ -129,35 +130,57 @@ def certify_exact(
         reason = (
             answer.reason if answer.metric is None else "metrics that fit the grid fail between"
         )
+        if look.beyond > 0:
+            reason += f" (Jacobians moved {100 * look.beyond:.2g} % outward for what lies between)"
         s = points[worst]
         reason += f", at y = {_text(s[:n])}, int z = {_text(s[n:])}{look.smaller()}"
         no = Certificate(False, "exact", domain, region=where, reason=reason, evidence="points")
         return replace(no, violated=look.at(s[None])[0])
     reason = (
         f"one metric at all {len(look.points) + len(points)} points of the box that were looked "
-        f"at, {margin:.2g} 1/s below the rate of the worst for what lies between, while the "
-        "trajectories stay in it"
+        f"at, their Jacobians moved {100 * look.beyond:.2g} % away from the mean, as far as fresh "
+        "points were seen beyond them, while the trajectories stay in it"
     )
     answer = replace(answer, rate=min(answer.rate, rate), reason=reason)
     return ball_in_box(answer, look.loop, look.keep, look.low, look.high, h)
 
 
+def shortfall(looked: Array, others: Array) -> float:
+    """By what share the hull of matrices (N, m, m) falls short of others, from 1000 directions."""
+    mean, size = looked.mean(axis=0), looked.std(axis=0)
+    size = np.where(size > 1e-6 * np.abs(looked).max(), size, np.inf)
+    ways = np.random.default_rng(4).normal(size=(mean.size, 1000))
+    seen, beyond = (
+        (((J - mean) / size).reshape(len(J), -1) @ ways).max(axis=0) for J in (looked, others)
+    )
+    return max(float(np.max(beyond / np.maximum(seen, 1e-300))) - 1.0, 0.0)
+
+
 class _Looked:
-    """Points of a box (y, int z), and the total Jacobians of a loop at them."""
+    """Points of a box (y, int z), and the total Jacobians of a loop at them.
+
+    What lies between is answered for by a margin: other points tell by which share the hull of the
+    Jacobians may fall short (`beyond`), and all are moved away from their mean by as much. A metric
+    that fits them then fits the enlarged hull.
+    """
 
     def __init__(self, loop: Loop, region: Region, h: float | None) -> None:
         self.loop, self.h, (self.low, self.high) = loop, h, region.limits
-        self.step = 1e-6 * (self.high - self.low)
-        self.points = spread(self.low, self.high, min(region.points, int(_GRID ** (0.5 / loop.n))))
-        self.keep = np.arange(2 * loop.n)
-        whole = self.at(self.points)
-        if not whole[:, : loop.n, loop.n :].any():  # the command does not depend on int z
-            self.keep = np.arange(loop.n)
+        self.step, n, rng = 1e-6 * (self.high - self.low), loop.n, np.random.default_rng(0)
+        grid = spread(self.low, self.high, min(region.points, int(_GRID ** (0.5 / n))))
+        others = rng.uniform(self.low, self.high, (2, _CHECKS, 2 * n))
+        points, self.keep = np.concatenate([grid, others[0]]), np.arange(2 * n)
+        whole = self.at(points)
+        if not whole[:, :n, n:].any():  # the command does not depend on int z
+            self.keep = np.arange(n)
         at = self.keep[:, None], self.keep
-        self.jacobians = whole[:, at[0], at[1]]
+        looked, fresh = whole[:, at[0], at[1]], self.at(others[1])
+        self.beyond, self.mean = shortfall(looked, fresh), looked.mean(axis=0)
+        self.points = np.concatenate([points, others[1]])
+        self.jacobians = self.outward(np.concatenate([looked, fresh]))
         # how far off a difference may be: rounding of the loop, and of the solver under a hold
-        size = (np.abs(whole) @ np.abs(self.points)[..., None]).max(axis=0)
-        size = size + np.abs(self.move(self.points)).max(axis=0)[:, None]
+        size = (np.abs(whole) @ np.abs(points)[..., None]).max(axis=0)
+        size = size + np.abs(self.move(points)).max(axis=0)[:, None]
         solved = 0.0 if h is None or loop.plant.constant else 1e-7
         self.slack = (4e-16 / self.step * size + solved * np.abs(whole).max(axis=0))[at]
 
@@ -175,13 +198,16 @@ class _Looked:
             raise ValueError("the policy uses int z in a part of the box only")
         return J[:, self.keep[:, None], self.keep]
 
+    def outward(self, J: Array) -> Array:
+        """Jacobians moved away from their mean by the share that others may lie beyond them."""
+        return np.asarray(self.mean + (1 + self.beyond) * (J - self.mean))
+
     def rates(self, metric: Array, s: Array) -> Array:
         """Rates in a metric at states (N, 2n), lowered by what rounding may hide, (N,)."""
         return rates_in(self.at(s), metric, self.h, self.slack)
 
     def certificate(self, progress: Progress | None) -> tuple[Certificate, Array, Array, float]:
         """The best answer, points it was tried at, their rates and a margin, or what resists it."""
-        low, high = self.low, self.high
         for turn in range(_ROUNDS):
             if progress is not None:
                 progress(f"box, round {turn + 1}: Jacobians at {len(self.points)} points")
@@ -190,20 +216,18 @@ class _Looked:
                 assert found.violated is not None
                 away = np.abs(self.jacobians - found.violated).max(axis=(1, 2))
                 return found, self.points, away, 0.0
-            metric = found.metric
-            others = np.random.default_rng(0).uniform(low, high, (_CHECKS, len(low)))
-            worst = np.argsort(rates_in(self.jacobians, metric, self.h))[:_WORST]
+            worst = np.argsort(rates_in(self.jacobians, found.metric, self.h))[:_WORST]
             points, rates, margin = lowest(
-                partial(self.rates, metric),
-                np.concatenate([others, self.points[worst]]),
-                lambda s: np.clip(s, low, high),
-                0.1 * (high - low),
+                partial(self.rates, found.metric),
+                self.points[worst],
+                lambda s: np.clip(s, self.low, self.high),
+                0.1 * (self.high - self.low),
             )
             if rates.min() - margin > 0.3 * found.rate:
                 break
             new = points[np.argsort(rates)[:_WORST]]
             self.points = np.concatenate([self.points, new])
-            self.jacobians = np.concatenate([self.jacobians, self.at(new)])
+            self.jacobians = np.concatenate([self.jacobians, self.outward(self.at(new))])
         return found, points, rates, margin
 
     def smaller(self) -> str:

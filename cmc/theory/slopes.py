@@ -46,8 +46,9 @@ def action_of(policy: Any, n: int) -> Action:
 
 
 def inner(policy: Any) -> Any:
-    """The policy that acts on s: what `cmc.sb3` keeps inside, the thing itself otherwise."""
-    return policy.on_signals() if hasattr(policy, "on_signals") else policy
+    """The policy that acts on s, on the CPU: what `cmc.sb3` keeps inside, or the thing itself."""
+    policy = policy.on_signals() if hasattr(policy, "on_signals") else policy
+    return copy.deepcopy(policy).cpu() if hasattr(policy, "cpu") else policy
 
 
 def factor_of(policy: Any, gains: Array) -> Array:
