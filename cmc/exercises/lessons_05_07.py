@@ -14,8 +14,8 @@ from scipy.linalg import expm
 from cmc.exercises import check, expect, expect_close, numbers
 from cmc.plants import LinearPlant
 from cmc.theory.certify import certify
-from cmc.theory.delay import LagLoop
 from cmc.theory.identification import fit_latent
+from cmc.theory.sampled import LagLoop
 
 # ---- lesson 05: slopes, a pumped swing, another quadrature, a plant of one's own
 

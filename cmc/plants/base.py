@@ -168,6 +168,8 @@ class FunctionPlant(Plant):
     ) -> None:
         if not all(isinstance(box, (list, tuple, np.ndarray)) and len(box) == 2 for box in (y, u)):
             raise ValueError(f"y and u each need (low, high), got y = {y!r}, u = {u!r}")
+        if not isinstance(name, str):
+            raise TypeError(f"name needs a string, got {name!r:.60}")
         for word, given in zip(("f", "f_y", "f_u"), (f, *jacobians), strict=True):
             if word == "f" or given is not None:
                 refuse_uncallable(word, given)
