@@ -101,17 +101,14 @@ class ModularPolicy(nn.Module):
 
     def command(self, s: Tensor, R: Tensor, T_a: Tensor | None = None) -> Tensor:
         """Return u = u0 + T_a a from s (..., n, 2), diag(R) (..., n) and T_a (..., n, n)."""
-        for name, value, shape in (("R", R, (self.n,)), ("T_a", T_a, (self.n, self.n))):
-            if name == "R" or value is not None:
-                check_tensor(name, value)
-                if tuple(value.shape[-len(shape) :]) != shape:
-                    raise ValueError(f"{name} needs (..., {shape}), got {tuple(value.shape)}")
-        factor = 1.0 / R if self.normalise else torch.sign(R)
         check_tensor("s", s)
+        check_tensor("R", R, self.n)
+        factor = 1.0 / R if self.normalise else torch.sign(R)
         pi = self.network(self._visible(s))
         pi = tanh(pi) if self.squash else pi
         if T_a is None:
             return torch.addcmul(self.u0, factor, pi, value=-1.0)  # constraint_sign
+        check_tensor("T_a", T_a, self.n, self.n)
         return self.u0 - (T_a * (factor * pi).unsqueeze(-2)).sum(-1)  # constraint_sign
 
     def jacobian(self, s: Tensor) -> Tensor:

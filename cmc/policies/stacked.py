@@ -33,10 +33,13 @@ def check_hidden(hidden: Sequence[int]) -> tuple[int, ...]:
     return tuple(count("hidden", size) for size in hidden)
 
 
-def check_tensor(name: str, value: Any) -> None:
-    """Refuse what is no tensor of floats."""
+def check_tensor(name: str, value: Any, *tail: int) -> None:
+    """Refuse what is no tensor of floats of shape (..., *tail)."""
     if not isinstance(value, Tensor) or not value.is_floating_point():
         raise TypeError(f"{name} needs a tensor of floats, got {value!r:.60}")
+    if tail and tuple(value.shape[-len(tail) :]) != tail:
+        wish = ", ".join(str(size) for size in tail)
+        raise ValueError(f"{name} needs shape (..., {wish}), got {tuple(value.shape)}")
 
 
 class StackedMLP(nn.Module):
