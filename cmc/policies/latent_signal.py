@@ -36,9 +36,6 @@ class LatentSignal(PositiveNetwork):
         n: number of axes.
         slope_min, slope_max: bounds on the slopes in (e, e'), positive, broadcast to (n, 2).
         hidden: sizes of the hidden layers.
-
-    Raises:
-        ValueError: if a slope may vanish, or the bounds leave no room.
     """
 
     def __init__(

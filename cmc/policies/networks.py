@@ -40,9 +40,6 @@ class PositiveNetwork(SignalNetwork):
         slope_max: M > m, broadcast to (n, 2), or None for no cap.
         joint_cap: pair (v, limit), v >= 0 broadcast to (n, 2) and limit > 0 broadcast to (n,):
             the cap v . slope <= limit, such as the sampled-data bound with v = (1, h/2).
-
-    Raises:
-        ValueError: for bounds that are not finite, negative, or leave no room for the network.
     """
 
     slope_min: Tensor

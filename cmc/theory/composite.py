@@ -71,7 +71,7 @@ class CompositeModel:
     @property
     def f_y(self) -> Array:
         """Latent Jacobian df/dy = -B_lat / A_lat, negative, 1/s (`LTI`)."""
-        return -self.B_lat / self.A_lat
+        return -self.latent_rate
 
     @property
     def f_u(self) -> Array:
@@ -113,9 +113,6 @@ def composite(
         root: "small" takes the paper's plus sign (smaller K2: y is mostly position, the fast pole
             is the composition, the slow one latent); "large" the minus sign (larger K2: the fast
             pole is latent).
-
-    Raises:
-        InfeasibleGainsError: where K_d^2 < 4 K_p lambda_d.
     """
     if not isinstance(root, str) or root not in ("small", "large"):
         raise ValueError(f"root must be 'small' or 'large', got {root!r}")

@@ -46,8 +46,9 @@ def blocks(space: AuxiliarySpace, slopes: ArrayLike, T_y_dot: ArrayLike | None =
     s = checked("slopes", slopes, "... n 2", n=space.n)
     A_blk, B_blk = space.Lambda, space.R
     if T_y_dot is not None:
-        rate, frozen = together(T_y_dot=_frame_rate(space, T_y_dot), space=A_blk)
-        A_blk = rate + frozen
+        dot = checked("T_y_dot", T_y_dot, "... n n", n=space.n)
+        dot, V, A_blk = together(T_y_dot=dot, V=space.V, space=A_blk)
+        A_blk = dot @ V + A_blk
     A_blk, B_blk, pi_1 = together(T_y_dot=A_blk, space=B_blk, slopes=s[..., 0, None])
     C_blk, D_blk = pi_1 * A_blk + s[..., 1, None] * np.eye(space.n), pi_1 * B_blk
     not_overflown("slopes and T_y_dot", A_blk, C_blk, D_blk)
@@ -65,17 +66,7 @@ def F(space: AuxiliarySpace, slopes: ArrayLike, T_y_dot: ArrayLike | None = None
 
 def F2(space: AuxiliarySpace, slopes: ArrayLike, T_y_dot: ArrayLike) -> Array:
     """Return the part of F that the moving transform adds, F - F_1 (F2), (..., 2n, 2n)."""
-    pi_1 = checked("slopes", slopes, "... n 2", n=space.n)[..., 0, None]
-    left, pi_1 = together(T_y_dot=_frame_rate(space, T_y_dot), slopes=pi_1)
-    zero = np.zeros(left.shape)
-    not_overflown("slopes and T_y_dot", left, pi_1 * left)
-    return np.block([[left, zero], [pi_1 * left, zero]])
-
-
-def _frame_rate(space: AuxiliarySpace, T_y_dot: ArrayLike) -> Array:
-    """T_y' T_y^-1 [1/s]."""
-    dot = checked("T_y_dot", T_y_dot, "... n n", n=space.n)
-    return np.matmul(*together(T_y_dot=dot, space=space.V))
+    return F(space, slopes, T_y_dot) - F(space, slopes)
 
 
 def Theta_M(space: AuxiliarySpace) -> Array:

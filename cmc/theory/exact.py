@@ -42,9 +42,6 @@ class Region:
         y_high: Upper corner, (n,).
         integral: Largest |int z| per dimension, (n,) or one number.
         points: Grid points per axis of y, as long as there are not more than 1024.
-
-    Raises:
-        ValueError: if the corners are no box.
     """
 
     y_low: ArrayLike

@@ -123,9 +123,6 @@ def largest_slope(
         h: Sample time, s, (...,).
         ratio: k2 / k1, 1/s, (...,); give this or `k2`.
         k2: A bound on the integral's own slope, 1/s, (...,).
-
-    Raises:
-        ValueError: if both `ratio` and `k2` are given, one is negative, or k2 leaves no room.
     """
     if ratio is not None and k2 is not None:
         raise ValueError("give ratio or k2, not both")

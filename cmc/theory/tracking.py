@@ -29,13 +29,11 @@ class Tracker:
     that turn by more than about 45 degrees cannot be followed.
     """
 
-    def __init__(self) -> None:
-        """Start without a past."""
-        self.reset()
+    _before: AuxiliarySpace | None = None
 
     def reset(self) -> None:
         """Forget the past: the next step fixes order and sign anew."""
-        self._before: AuxiliarySpace | None = None
+        self._before = None
 
     def update(self, f_y: ArrayLike, f_u: ArrayLike) -> AuxiliarySpace:
         """Return the auxiliary space of this step; f_y [1/s] and f_u are (n, n)."""
