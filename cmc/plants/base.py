@@ -119,12 +119,7 @@ class Plant(ABC):
 
 
 class LinearPlant(Plant):
-    """y' = A y + B u with constant matrices.
-
-    Args:
-        A: State matrix f_y, (n, n), 1/s.
-        B: Command matrix f_u, (n, n), 1/s.
-    """
+    """y' = A y + B u with constant matrices f_y = A and f_u = B, (n, n) each, in 1/s."""
 
     name = "linear"
     constant = True

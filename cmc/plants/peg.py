@@ -18,14 +18,8 @@ class Peg(Plant):
     `f`, `f_y` and `f_u` are the model IN CONTACT: out of contact the force stays zero, its row of
     f_u vanishes and no theorem about f_u^-1 applies. `step` is the plant itself, contact or not.
 
-    Parameters may be arrays that broadcast over the batch axes of y.
-
-    Args:
-        tau_x: Time constant along the surface, s.
-        tau_z: Time constant across the surface, s.
-        K_sur: Stiffness of the surface, force per length (the paper gives no units).
-        surface_sin: Coefficient of sin x in the surface.
-        surface_cos: Coefficient of cos x in the surface.
+    Time constants tau_x along and tau_z across the surface are in s, its stiffness K_sur in force
+    per length (the paper gives no units). All parameters may be arrays that broadcast over y.
     """
 
     name = "peg"

@@ -165,11 +165,6 @@ def theorem1_margin(
     The theorem's text compares `F1^T + F1`, without the half, with beta, and its proof halves it:
     they differ by a factor 2. The proof's convention is used here, because only there beta is the
     rate; the text's beta is twice this number.
-
-    Args:
-        space: Auxiliary space, arrays (..., n, n).
-        slopes: Signed slopes of the policy, (..., n, 2).
-        T_y_dot: Time derivative of `T_y` [1/s], (..., n, n); none if constant.
     """
     _asked(space)
     margin = contraction_rate(F(space, slopes))  # F1_theorem1

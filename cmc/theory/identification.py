@@ -136,15 +136,9 @@ def fit_latent(y: ArrayLike, u: ArrayLike, y_next: ArrayLike, dt: float) -> Late
     looks like one at 2 pi / dt - w (aliasing), and no data at this `dt` can tell them apart. Below
     four samples a turn, dt > pi / (2 w), a warning says so.
 
-    Args:
-        y: latent signals (N, n).
-        u: commands (N, m).
-        y_next: latent signals one sample later (N, n).
-        dt: sample time, s.
-
-    Raises:
-        PoorDataError: if the data do not tell all coefficients apart, or if no continuous-time
-            model has the fitted map (an eigenvalue of Phi on the negative real axis).
+    Signals y (N, n), commands u (N, m), the signals one sample later y_next (N, n), dt in s. A
+    PoorDataError says that the data do not tell all coefficients apart, or that no continuous-time
+    model has the fitted map (an eigenvalue of Phi on the negative real axis).
     """
     y = checked("y", y, "N n")
     u = checked("u", u, "N m", N=len(y))

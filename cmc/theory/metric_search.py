@@ -56,11 +56,7 @@ def condition_metric(vertices: ArrayLike, metric: ArrayLike, *, discrete: bool =
 
     Minimises kappa subject to the inequalities and I <= M <= kappa I, from a metric that meets
     them, to within 2 %. A smaller condition number is a smaller bound on the transient.
-
-    Args:
-        vertices: Matrices, (V, m, m), as in `search_metric`.
-        metric: A common metric of the vertices, (m, m).
-        discrete: Whether the vertices are steps of a sampled loop.
+    Arguments as of `search_metric`.
     """
     J = checked("vertices", vertices, "V m m")
     metric_factor(metric)

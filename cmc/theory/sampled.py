@@ -68,12 +68,8 @@ def sampled_matrix(
 ) -> Array:
     """One step in (z_k, I_{k-1}) of a_k = -(k1 z_k + k2 I_k), I_k = I_{k-1} + h z_k, (..., 2, 2).
 
-    Args:
-        k1: Slope in z, signed so that positive damps for R > 0, (...,).
-        k2: Slope in the integral, (...,).
-        Lambda: Open-loop rate, 1/s, (...,); -1/tau for a lag.
-        R: Gain, (...,); K/tau for a lag.
-        h: Sample time, s.
+    Slopes k1 and k2, positive where they damp for R > 0; Lambda in 1/s and R are -1/tau and K/tau
+    for a lag, (...,) each; h in s.
     """
     phi, G = hold_lag(Lambda, R, h)
     phi, G, k1, k2 = np.broadcast_arrays(phi, G, checked("k1", k1), checked("k2", k2))
@@ -117,12 +113,8 @@ def largest_slope(
     k1 < coth(h/(2 tau))/K - (h/2) k2, divided by 1 + h ratio/2 where k2 = ratio k1.
     For the bare loop (k2 = 0) it is (1 + phi)/((1 - phi) K) with phi = e^{-h/tau}.
 
-    Args:
-        tau: Time constant, s, (...,).
-        K: Static gain, positive, (...,).
-        h: Sample time, s, (...,).
-        ratio: k2 / k1, 1/s, (...,); give this or `k2`.
-        k2: A bound on the integral's own slope, 1/s, (...,).
+    Time constant tau (s), static gain K > 0 and sample time h (s); give ratio = k2 / k1 (1/s) or a
+    bound k2 on the integral's own slope (1/s), (...,) each.
     """
     if ratio is not None and k2 is not None:
         raise ValueError("give ratio or k2, not both")

@@ -240,11 +240,8 @@ def compose_hierarchical(
     Block i is driven by blocks j > i only. Scaling block i by eps^(n-1-i) shrinks every coupling by
     a power of eps, so some eps > 0 keeps the rate as near to the slowest block's as wanted.
 
-    Args:
-        metrics: One metric per block, (m_i, m_i).
-        rates: One rate per block, 1/s, positive.
-        couplings: For i < j the vertices (V, m_i, m_j) of the block through which j drives i.
-        h: Sample time, s, where the blocks are steps.
+    One metric (m_i, m_i) and one rate (1/s) a block; couplings[i, j], i < j, are the vertices
+    (V, m_i, m_j) through which j drives i; h (s) where the blocks are steps.
     """
     if not (np.isfinite(rates).all() and min(rates) > 0):
         raise ValueError(f"every block needs a positive rate, got {list(rates)}")
