@@ -106,10 +106,9 @@ def composite(
     B_lat = lambda_d and A_lat = lambda_d / K2 (`lambda_b_2`). Where K_p = 0: y = e', A_lat =
     lambda_d, B_lat = K_d (`lambda_b_1`).
 
-    Stiffness K_p >= 0, damping K_d > 0 and lambda_d > 0 (1 for acceleration-based control) broadcast
-    to (...,). The root "small" takes the paper's plus sign (smaller K2: y is mostly position, the
-    fast pole is the composition, the slow one latent), "large" the minus sign (larger K2: the fast
-    pole is latent).
+    K_p >= 0, K_d > 0 and lambda_d > 0 (1 for acceleration-based control) broadcast to (...,). The
+    root "small" takes the paper's plus sign (smaller K2: y is mostly position, the fast pole is the
+    composition, the slow one latent), "large" the minus sign (larger K2: the fast pole is latent).
     """
     if not isinstance(root, str) or root not in ("small", "large"):
         raise ValueError(f"root must be 'small' or 'large', got {root!r}")
