@@ -253,18 +253,18 @@ class _OnSignals:
     ) -> None:
         if scales is not None and set(policy.layout) != {"s"}:
             raise ValueError("VecNormalize scales T_a and R as well: the policy sees wrong ones")
+        policy = copy.deepcopy(policy).cpu()
         self.n, self.layout, self.normalise = policy.n, policy.layout, policy.normalise
         self.integral, self.squash, self.R = policy.integral, policy.squash, policy.R.numpy()
         low, high = (-1.0, 1.0) if box is None else (box.low.astype(float), box.high.astype(float))
         self.half, self.u0 = (high - low) / 2, (high + low) / 2 + policy.u0.numpy()
-        self.network = copy.deepcopy(policy.network).double()
         self.mean, self.std, self.clip = 0.0, np.ones((self.n, 2)), np.inf
         if scales is not None:
             part, shape = policy.layout["s"], (self.n, 2)
             self.mean = scales.obs_rms.mean[part].reshape(shape)
             self.std = np.sqrt(scales.obs_rms.var[part] + scales.epsilon).reshape(shape)
             self.clip = float(scales.clip_obs)
-        self.bounds = policy.slope_bounds()
+        self.bounds, self.network = policy.slope_bounds(), policy.network.double()
 
     def pi(self, s: Array) -> Array:
         """The action before the sign rule, on the plain signals, (..., n, 2) to (..., n)."""

@@ -5,8 +5,8 @@ import pytest
 from lesson import run
 
 from cmc.theory.contraction import F
-from cmc.theory.delay import LagLoop
 from cmc.theory.robustness import ErrorBall, peak_gain, reach, signal_length
+from cmc.theory.sampled import LagLoop
 
 
 @pytest.fixture(scope="module")

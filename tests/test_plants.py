@@ -53,7 +53,7 @@ def test_every_plant_is_batched_described_and_has_the_jacobians_of_its_f(name):
             (lambda n=n: plants.get(n).f_y(np.zeros(2), 1.0), "u needs shape")
             for n in plants.names()
         ),
-        (lambda: plants.get("boat"), "no plant is called 'boat'"),
+        (lambda: plants.get("boat"), "name needs one of .* got 'boat'"),
         (lambda: plants.get("peg", K_sur=[1.0, -1.0]), "K_sur needs positive"),
         (lambda: plants.get("pendulum", damping=np.nan), "damping needs finite"),
         (lambda: plants.LinearPlant(np.eye(2), np.eye(3)), r"B needs shape \(2, 2\)"),
@@ -61,7 +61,7 @@ def test_every_plant_is_batched_described_and_has_the_jacobians_of_its_f(name):
         (lambda: plants.get("spiral", omega=0.0), "not be complex"),
         (lambda: plants.get("unstable_mode", growth=-3.0), "growth needs values above -2"),
         (lambda: plants.get("lags", tau=[1.0], gain=[1.0, 2.0]), r"gain needs shape \(1,\)"),
-        (lambda: plants.get("peg").step(1.0, 0.0, np.zeros(2), 0.0), "positive sample time"),
+        (lambda: plants.get("peg").step(1.0, 0.0, np.zeros(2), 0.0), "h needs positive"),
         (lambda: plants.get("lags").space("a"), "y needs real numbers"),
     ],
 )
@@ -165,3 +165,23 @@ def test_papers_peg_jacobian_has_the_wrong_sign_in_most_samples():
     wrong = np.mean(np.sign(exact) != np.sign(paper))
     assert wrong == pytest.approx(0.63, abs=0.015)
     np.testing.assert_array_equal(np.diagonal(peg.f_y(y, u), 0, -2, -1)[:, 0], -1 / 0.0437)
+
+
+@pytest.mark.parametrize("bad", [None, "x", 1j, object(), {}, ["a", "b"]])
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("name", plants.get),
+        ("tau", lambda x: plants.Lags(tau=x)),
+        ("A", lambda x: plants.LinearPlant(x, np.eye(2))),
+        *(("y", lambda x, n=n: plants.get(n).f(x, [0.1, 0.1])) for n in plants.names()),
+        *(("u", lambda x, n=n: plants.get(n).f_u([1.5, -1.0], x)) for n in plants.names()),
+        ("h", lambda x: plants.Peg().step(1.0, 0.0, [1.0, 0.0], x)),
+        ("x", lambda x: plants.Peg().contact_force(x, 0.0)),
+        ("force", lambda x: plants.Peg().height(1.0, x)),
+        ("y", plants.Peg().f_y_paper),
+    ],
+)
+def test_what_is_wrong_is_named(name, call, bad):
+    with pytest.raises((TypeError, ValueError), match=rf"\b{name}\b"):
+        call(bad)

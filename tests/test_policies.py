@@ -15,8 +15,10 @@ from cmc.policies import (
     ModularPolicy,
     NegativeWeightError,
     PositiveNetwork,
+    StackedMLP,
     as_numpy,
 )
+from cmc.policies.latent_signal import Trial
 
 f64 = torch.float64
 
@@ -127,7 +129,7 @@ def test_batch_axes_are_free(kind):
     torch.testing.assert_close(seeded(s[:2])[:, 4], seeded(s[:2, 4:5])[:, 0])
     with pytest.raises(ValueError, match="seeds|flat inputs"):
         seeded(s)
-    with pytest.raises(ValueError, match="wanted"):
+    with pytest.raises(ValueError, match="s needs"):
         network(signals(4, 2, 2).float())
 
 
@@ -195,7 +197,7 @@ def test_observation_layout():
         as_numpy(policy)(observation.numpy())
     with pytest.raises(ValueError, match="layout"):
         ModularPolicy(PositiveNetwork(2), layout={"R": slice(4)})
-    with pytest.raises(ValueError, match="no zero"):
+    with pytest.raises(ValueError, match="without zeros"):
         ModularPolicy(PositiveNetwork(2), R=[1.0, 0.0])
     constant = ModularPolicy(PositiveNetwork(2, dtype=f64), R=[2.0, -3.0])
     plain = observation[1, :, :4]
@@ -262,12 +264,43 @@ def test_state_dict_round_trip_and_refusal():
         ({"slope_max": [1.0, 2.0, 3.0]}, "shape"),
         ({"slope_min": 0.5, "joint_cap": ([1.0, 1.0], 0.9)}, "no room"),
         ({"joint_cap": ([0.0, 0.0], 1.0)}, "no room"),
-        ({"seeds": []}, "at least one seed"),
-        ({"seeds": [-1]}, "at least one seed"),
-        ({"hidden": ()}, "hidden"),
+        ({"seeds": []}, "seeds needs"),
+        ({"seeds": [-1]}, "seeds needs"),
+        ({"seeds": "0"}, "seeds needs"),
         ({"hidden": (0,)}, "hidden"),
+        ({"joint_cap": 1.0}, "joint_cap needs a pair"),
+        ({"bias": "no"}, "bias needs"),
     ],
 )
 def test_bad_options(options, match):
     with pytest.raises(ValueError, match=match):
         PositiveNetwork(2, **options)
+
+
+NET = PositiveNetwork(2)
+
+
+@pytest.mark.parametrize("bad", [None, "x", np.nan, -1, 1j, [], object(), np.zeros((2, 3, 5))])
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        *(("n", kind) for kind in (PositiveNetwork, JointNetwork, ConvexGradientNetwork)),
+        ("hidden", lambda x: IndependentNetwork(2, hidden=x)),
+        ("gains", LinearNetwork),
+        ("mu", lambda x: ConvexGradientNetwork(2, mu=x)),
+        ("copies", lambda x: StackedMLP(2, 1, copies=x)),
+        ("network", ModularPolicy),
+        ("part", lambda x: DirectPolicy(JointNetwork(2, inputs=3), part=x)),
+        ("policy", as_numpy),
+        ("s", NET),
+        ("s", ConvexGradientNetwork(2).jacobian),
+        ("R", lambda x: ModularPolicy(NET).command(torch.zeros(3, 2, 2), x)),
+        ("observation", ModularPolicy(NET)),
+        ("observation", lambda x: as_numpy(ModularPolicy(NET, layout={"s": slice(2, 6)}))(x)),
+        ("starts", lambda x: Trial(x, 0.1, 1.0)),
+        ("duration", lambda x: Trial(np.zeros((3, 2, 2)), 0.1, x)),
+    ],
+)
+def test_what_is_wrong_is_named(name, call, bad):
+    with pytest.raises((TypeError, ValueError), match=rf"\b{name}\b"):
+        call(bad)

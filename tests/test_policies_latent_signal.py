@@ -88,7 +88,7 @@ def test_the_hand_made_signal_is_the_case_of_constant_slopes():
     wild = certify_latent(LatentSignal(2, slope_min=0.01, slope_max=500.0), policy(), KP, KD)
     assert not wild
     assert wild.reason.startswith("axis 1")
-    with pytest.raises(ValueError, match="slope_min above 0"):
+    with pytest.raises(ValueError, match="slope_min needs positive"):
         LatentSignal(2, slope_min=[0.0, 1.0], slope_max=[1.0, 2.0])
 
 

@@ -170,17 +170,6 @@ def test_exact_sampled_certificate_of_the_peg_is_obeyed_by_the_peg_itself():
     assert (ratio(path, answer.metric) <= bound * (1 + 1e-6)).all()
 
 
-def test_points_and_frozen_answers_say_what_they_are():
-    box = Region([-0.3, -0.3], [0.3, 0.3], integral=0.3)
-    points = certify(policy((0.5, 0.5), (1.5, 1.5)), plants.get("pendulum"), region=box)
-    assert points.evidence == "points"
-    assert "at the points tried" in str(points)
-    frozen = certify(policy(), plants.get("pendulum"), kind="frozen", region=box)
-    assert not frozen
-    assert "proves nothing" in frozen.reason
-    assert frozen.rate > 0
-
-
 class Bounds:
     """A policy of which only the interval of its slopes is known."""
 
@@ -271,3 +260,26 @@ def test_long_questions_report_their_progress():
     assert lines[0] == "round 1: one metric for 40 of 64 vertices"
     with pytest.raises(TypeError, match="progress"):
         certify(policy(n=3), plant, progress="yes")
+
+
+def test_a_policy_on_another_device_is_brought_to_the_cpu():
+    pytest.importorskip("torch")
+    from cmc.policies import ModularPolicy, PositiveNetwork
+
+    class Elsewhere(ModularPolicy):
+        """Its weights cannot be read before `cpu`, as those on a GPU."""
+
+        here = False
+
+        def cpu(self):
+            self.here = True
+            return super().cpu()
+
+        def slope_bounds(self):
+            if not self.here:
+                raise TypeError("can't convert cuda:0 device type tensor to numpy")
+            return super().slope_bounds()
+
+    away = Elsewhere(PositiveNetwork(2, hidden=(8,), slope_min=0.5, slope_max=1.0))
+    assert certify(away, plants.get("coupled_lags"))
+    assert not away.here

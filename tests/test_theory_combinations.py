@@ -17,10 +17,9 @@ from cmc.theory.combinations import (
     real_block_form,
     schur,
 )
-from cmc.theory.contraction import F, contraction_rate, subsystems
+from cmc.theory.contraction import F, contraction_rate, slope_floor, subsystems, theorem2_margin
 from cmc.theory.explicit import ComplexEigenvalueError, DefectiveMatrixError, SingularInputError
 from cmc.theory.identification import differences
-from cmc.theory.margins import slope_floor, theorem2_margin
 from cmc.theory.simulate import Loop
 
 

@@ -4,8 +4,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from cmc.theory.auxiliary import AuxiliarySpace, decompose
-from cmc.theory.contraction import F2, F, Theta_M, blocks, subsystems
-from cmc.theory.margins import theorem2_margin
+from cmc.theory.contraction import F2, F, Theta_M, blocks, subsystems, theorem2_margin
 
 SLOPES = np.array([[-1.5, -0.8], [-0.4, -2.0]])
 

@@ -6,8 +6,9 @@ from test_theory_certify import policy, ratio
 
 from cmc import plants
 from cmc.theory.auxiliary import AuxiliarySpace
+from cmc.theory.ball import lowest
 from cmc.theory.certify import certify
-from cmc.theory.exact import Region
+from cmc.theory.exact import Region, shortfall
 from cmc.theory.identification import differences
 from cmc.theory.simulate import Loop, closed_loop
 
@@ -101,3 +102,29 @@ def test_exact_is_refused_where_it_cannot_be_had():
 
     lags = plants.get("lags")
     assert "track" in certify(policy(), lags, kind="exact", transforms=flipping).reason
+
+
+def test_the_hull_of_what_was_looked_at_is_enlarged_by_what_lies_beyond():
+    """Matrices diag(x) with |x| <= 0.8 of 1, 0.5: others reach 1 / 0.8 as far, units apart."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1, 1, (4000, 2)) * [1.0, 1e-6]
+    J = np.einsum("ki,ij->kij", x, np.eye(2)) + [[0.0, 3.0], [0.0, 0.0]]
+    inside = J[np.abs(x[:, 0]) < 0.8]
+    assert shortfall(J, inside) == 0.0
+    assert shortfall(inside, J) == pytest.approx(0.25, abs=0.02)
+    assert shortfall(J[:1].repeat(5, axis=0), J[:1]) == 0.0
+    assert shortfall(J, 3 * J) == pytest.approx(2.0, abs=0.1)
+
+
+def test_going_downhill_finds_what_random_points_miss():
+    """A hole of a thousandth of the square, in a bowl; and the margin that is left."""
+    bowl = lambda x: ((x - 0.3) ** 2).sum(-1) - 0.1 * (((x - 0.3) ** 2).sum(-1) < 3e-4)  # noqa: E731
+    start = np.random.default_rng(0).uniform(-1, 1, (64, 2))
+    assert bowl(start).min() > 0
+    points, values, _ = lowest(bowl, start, lambda x: np.clip(x, -1, 1), np.full(2, 0.1))
+    assert values.min() < -0.09
+    np.testing.assert_array_equal(values, bowl(points))
+    slope = lambda x: x.sum(-1)  # noqa: E731
+    points, values, margin = lowest(slope, start, lambda x: np.clip(x, -1, 1), np.full(2, 0.1))
+    assert np.abs(points).max() <= 1
+    assert values.min() - margin <= -2 <= values.min()

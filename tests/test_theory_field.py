@@ -128,6 +128,7 @@ def test_a_region_is_looked_at_where_nothing_holds_everywhere():
         answer = certify(policy, plant, region=BOX)
         assert answer, str(answer)
         assert answer.evidence == "points"
+        assert "at the points tried" in str(answer)
         assert "0.3" in answer.region
 
 

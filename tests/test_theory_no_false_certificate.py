@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.false_certificates import falsehood
+from benchmarks.false_certificates import Truth, falsehood, held_still
 from benchmarks.questions import KINDS, draw
 
 
@@ -39,3 +39,21 @@ def test_the_check_finds_a_certificate_that_is_false():
     object.__setattr__(answer, "rate", answer.rate / 30)
     trial.policy.R = -np.ones(trial.plant.n)
     assert falsehood(trial, answer, np.random.default_rng(0)) != ""
+
+
+@pytest.mark.parametrize("seed", [20749, 30164])
+def test_a_metric_that_fails_between_the_points_is_no_certificate(seed):
+    """A loop of which 3000 points fit a metric, at 1e-7 1/s, and one in 3000 others does not."""
+    answer = draw(seed).ask()
+    assert not answer
+    assert "outward" in answer.reason
+
+
+def test_the_check_takes_R_where_the_command_holds_the_plant():
+    """B (u + g u^3): at u = 0 the sign of R is another one, and the loop that has it diverges."""
+    trial = draw(32392)
+    answer = trial.ask()
+    assert answer.holds
+    assert falsehood(trial, answer, np.random.default_rng(1)) == ""
+    y = Truth(trial).states(np.random.default_rng(2), 50)[:, : trial.plant.n]
+    assert np.abs(trial.plant.f(y, held_still(trial.plant, y))).max() < 1e-9

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_continuous_lyapunov
 
-from cmc.theory.certificates import circle_criterion, common_metric
+from cmc.theory.certificates import circle_criterion
 from cmc.theory.contraction import contraction_rate
 from cmc.theory.robustness import (
     KINDS,
@@ -172,18 +172,6 @@ def test_nominal_metric_solves_the_lyapunov_equation_and_judges_real_loops(share
             loop + (real - loop) * (0.999 * contraction_rate(loop, metric) / size)[:, None, None]
         )
         assert (contraction_rate(small, metric) > 0).all()
-
-
-def test_a_metric_made_for_all_models_passes_all_of_them():
-    # lag with tau in [0.5, 1.5] and gain in [1, 2] times the nominal: four corners, one metric
-    corners = [
-        [[-(1 + 0.5 * gain) / tau, -2.0 * gain / tau], [1.0, 0.0]]
-        for tau in (0.5, 1.5)
-        for gain in (1.0, 2.0)
-    ]
-    found = common_metric(corners)
-    assert found
-    assert contraction_rate(corners, found.metric).min() == pytest.approx(found.rate)
 
 
 def test_ball_of_a_certificate_takes_its_metric_and_its_rate():

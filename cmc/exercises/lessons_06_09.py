@@ -12,9 +12,8 @@ from scipy.linalg import expm
 
 from cmc.exercises import check, compare, expect, expect_close, numbers
 from cmc.plants import Peg
-from cmc.theory.delay import LagLoop
 from cmc.theory.identification import fit_latent
-from cmc.theory.sampled import sampled_matrix
+from cmc.theory.sampled import LagLoop, sampled_matrix
 
 
 def _poles(K_p: float, K_d: float, g: float, dt: float) -> np.ndarray:

@@ -34,5 +34,5 @@ def names() -> tuple[str, ...]:
 def get(name: str, **params: Any) -> Plant:
     """Build a plant by name; `params` go to its constructor."""
     if not isinstance(name, str) or name not in _PLANTS:
-        raise ValueError(f"no plant is called {name!r}; there are {', '.join(names())}")
+        raise ValueError(f"name needs one of {', '.join(names())}; got {name!r:.60}")
     return _PLANTS[name](**params)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import Array, checked, not_square, together
+from cmc.theory.arrays import Array, checked, not_square, refuse_uncallable, together
 from cmc.theory.auxiliary import AuxiliarySpace, decompose
 from cmc.theory.identification import complex_step, differences, jacobian_fault
 from cmc.theory.simulate import equilibrium
@@ -119,12 +119,7 @@ class Plant(ABC):
 
 
 class LinearPlant(Plant):
-    """y' = A y + B u with constant matrices.
-
-    Args:
-        A: State matrix f_y, (n, n), 1/s.
-        B: Command matrix f_u, (n, n), 1/s.
-    """
+    """y' = A y + B u with constant matrices f_y = A and f_u = B, (n, n) each, in 1/s."""
 
     name = "linear"
     constant = True
@@ -168,8 +163,11 @@ class FunctionPlant(Plant):
     ) -> None:
         if not all(isinstance(box, (list, tuple, np.ndarray)) and len(box) == 2 for box in (y, u)):
             raise ValueError(f"y and u each need (low, high), got y = {y!r}, u = {u!r}")
-        if not all(callable(g) for g in (f, *jacobians) if g is not None):
-            raise TypeError("f, f_y and f_u need to be functions of y and u")
+        if not isinstance(name, str):
+            raise TypeError(f"name needs a string, got {name!r:.60}")
+        for word, given in zip(("f", "f_y", "f_u"), (f, *jacobians), strict=True):
+            if word == "f" or given is not None:
+                refuse_uncallable(word, given)
         self.y_low = checked("y[0]", y[0], "n").copy()
         self.name, self.n = name, len(self.y_low)
         self.y_high = checked("y[1]", y[1], "n", n=self.n).copy()
@@ -182,8 +180,8 @@ class FunctionPlant(Plant):
         )
         if (self.y_low >= self.y_high).any() or (self.u_low >= self.u_high).any():
             raise ValueError("y and u each need (low, high) with low < high")
-        self.state_names = tuple(state_names or (f"y{i + 1}" for i in range(self.n)))
-        self.units = tuple(units or ("1",) * self.n)
+        self.state_names = _words("state_names", state_names, [f"y{i + 1}" for i in range(self.n)])
+        self.units = _words("units", units, ["1"] * self.n)
         self._f, self._own = f, jacobians
         self._timed = _takes_time(f)
         with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -293,6 +291,15 @@ class FunctionPlant(Plant):
         tol = 1e-9 if self.how != "central differences" else 1e-6
         size = tol * (np.abs(y) @ np.abs(A).T + np.abs(u) @ np.abs(B).T)
         return bool((np.abs(found - wanted) <= size).all() and (found == later).all())
+
+
+def _words(name: str, given: Sequence[str] | None, usual: list[str]) -> tuple[str, ...]:
+    """One word for each signal."""
+    words = usual if given is None else given
+    fits = isinstance(words, (list, tuple)) and all(isinstance(word, str) for word in words)
+    if not fits or len(words) != len(usual):
+        raise ValueError(f"{name} needs {len(usual)} strings, got {given!r:.60}")
+    return tuple(words)
 
 
 def _takes_time(f: Function) -> bool:

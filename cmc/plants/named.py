@@ -12,9 +12,7 @@ from cmc.theory.arrays import Array, checked, not_overflown, number
 class Lags(LinearPlant):
     """Two separate first-order lags, tau_i y_i' = -y_i + gain_i u_i: nothing to transform.
 
-    Args:
-        tau: Time constants, s, (n,).
-        gain: Static gains, (n,).
+    Time constants tau in s and static gains, (n,) each.
     """
 
     name = "lags"
@@ -54,9 +52,7 @@ class CoupledLags(LinearPlant):
 class Spiral(LinearPlant):
     """A complex pair, f_y = V [[s, w], [-w, s]] V^-1: no real T_y makes it triangular.
 
-    Args:
-        sigma: Real part s, 1/s; negative is stable.
-        omega: Imaginary part w, rad/s, not zero.
+    Real part sigma in 1/s, negative is stable; imaginary part omega in rad/s, not zero.
     """
 
     name = "spiral"
@@ -75,9 +71,6 @@ class UnstableMode(LinearPlant):
 
     Eigenvalues growth and -2 along skewed eigenvectors; theorem 2 (`eq_theorem2`) then demands
     |d pi_1 / d s_11| > growth / |R_11|.
-
-    Args:
-        growth: Eigenvalue of the growing mode, 1/s, above -2.
     """
 
     name = "unstable_mode"
@@ -95,10 +88,7 @@ class Pendulum(Plant):
     u2 is a torque over the inertia; u1 turns the mount, because f_u has to be invertible: leave it
     at zero for the textbook system. The default is overdamped, so that both eigenvalues of f_y are
     real at every angle; the upper half has one positive eigenvalue.
-
-    Args:
-        damping: Damping over inertia, 1/s.
-        stiffness: Gravity over length, 1/s^2.
+    Damping is over inertia, in 1/s; stiffness is gravity over length, in 1/s^2.
     """
 
     name = "pendulum"

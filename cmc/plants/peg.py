@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmc.plants.base import Plant
-from cmc.theory.arrays import Array, checked, not_overflown
+from cmc.theory.arrays import Array, checked, not_overflown, number
 
 
 class Peg(Plant):
@@ -18,14 +18,8 @@ class Peg(Plant):
     `f`, `f_y` and `f_u` are the model IN CONTACT: out of contact the force stays zero, its row of
     f_u vanishes and no theorem about f_u^-1 applies. `step` is the plant itself, contact or not.
 
-    Parameters may be arrays that broadcast over the batch axes of y.
-
-    Args:
-        tau_x: Time constant along the surface, s.
-        tau_z: Time constant across the surface, s.
-        K_sur: Stiffness of the surface, force per length (the paper gives no units).
-        surface_sin: Coefficient of sin x in the surface.
-        surface_cos: Coefficient of cos x in the surface.
+    Time constants tau_x along and tau_z across the surface are in s, its stiffness K_sur in force
+    per length (the paper gives no units). All parameters may be arrays that broadcast over y.
     """
 
     name = "peg"
@@ -56,31 +50,29 @@ class Peg(Plant):
 
     def surface(self, x: ArrayLike) -> Array:
         """Height of the surface g(x)."""
+        x = checked("x", x, finite=False)
         return self.surface_sin * np.sin(x) + self.surface_cos * np.cos(x)
 
     def surface_slope(self, x: ArrayLike) -> Array:
         """Slope of the surface g'(x)."""
+        x = checked("x", x, finite=False)
         return self.surface_sin * np.cos(x) - self.surface_cos * np.sin(x)
 
     def contact_force(self, x: ArrayLike, z: ArrayLike) -> Array:
         """Force of the surface on the peg, K_sur min(z - g(x), 0): never positive."""
-        return self.K_sur * np.minimum(np.asarray(z, dtype=float) - self.surface(x), 0.0)
+        return self.K_sur * np.minimum(checked("z", z, finite=False) - self.surface(x), 0.0)
 
     def height(self, x: ArrayLike, force: ArrayLike) -> Array:
         """Height z that gives `force` in contact: z = force / K_sur + g(x)."""
-        return np.asarray(force, dtype=float) / self.K_sur + self.surface(x)
+        return checked("force", force, finite=False) / self.K_sur + self.surface(x)
 
     def step(self, x: ArrayLike, z: ArrayLike, u: ArrayLike, h: float) -> tuple[Array, Array]:
         """Positions after `h` seconds under a held command: exact, since both lags are linear.
 
         x and z are (...), u = (u_x, u_z) is (..., 2); returns the new x and z, each (...).
         """
-        if not h > 0:
-            raise ValueError(f"h needs a positive sample time in seconds, got {h}")
-        x, u = np.asarray(x, dtype=float), np.asarray(u, dtype=float)
-        if u.ndim == 0 or u.shape[-1] != 2:
-            raise ValueError(f"peg: u needs shape (..., 2), got {u.shape}")
-        z = np.asarray(z, dtype=float)
+        h, u = number("h", h, above=0.0), checked("u", u, "... 2", finite=False)
+        x, z = checked("x", x, finite=False), checked("z", z, finite=False)
         x_new = u[..., 0] + (x - u[..., 0]) * np.exp(-h / self.tau_x)
         z_new = u[..., 1] + (z - u[..., 1]) * np.exp(-h / self.tau_z)
         return x_new, z_new
@@ -109,7 +101,7 @@ class Peg(Plant):
 
     def f_y_paper(self, y: ArrayLike) -> Array:
         """The paper's approximation of f_y (appendix F); its lower left sign is often wrong."""
-        x = np.asarray(y, dtype=float)[..., 0]
+        x = checked("y", y, "... 2")[..., 0]
         slope, secant = self.surface_slope(x), self.surface(x) / x
         lower = self.K_sur * (slope / self.tau_x - secant / self.tau_z)
         return _lower_triangular(-1 / self.tau_x, lower, -1 / self.tau_z)

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from cmc.policies.networks import PositiveNetwork
+from cmc.theory.arrays import checked, count, number, refuse_uncallable
 
 Array = NDArray[np.float64]
 
@@ -35,9 +36,6 @@ class LatentSignal(PositiveNetwork):
         n: number of axes.
         slope_min, slope_max: bounds on the slopes in (e, e'), positive, broadcast to (n, 2).
         hidden: sizes of the hidden layers.
-
-    Raises:
-        ValueError: if a slope may vanish, or the bounds leave no room.
     """
 
     def __init__(
@@ -48,10 +46,7 @@ class LatentSignal(PositiveNetwork):
         slope_max: ArrayLike,
         hidden: Sequence[int] = (16, 16),
     ) -> None:
-        if not (np.asarray(slope_min, dtype=float) > 0).all():
-            raise ValueError(
-                f"wanted slope_min above 0, so that e' can be told from y; got {slope_min!r}"
-            )
+        checked("slope_min", slope_min, above=0.0)  # so that e' can be told from y
         bounds: dict[str, Any] = {"slope_min": slope_min, "slope_max": slope_max}
         super().__init__(n, hidden=hidden, bias=False, dtype=torch.float64, **bounds)
 
@@ -83,6 +78,13 @@ class Trial:
     duration: float
     steps: int = 100
     priced: Callable[[Tensor, Tensor, Tensor], Tensor] = lambda e, e_dot, p: p
+
+    def __post_init__(self) -> None:
+        checked("starts", self.starts, "N n 2")
+        number("effort", self.effort, least=0.0)
+        number("duration", self.duration, above=0.0)
+        count("steps", self.steps, 100_000)
+        refuse_uncallable("priced", self.priced)
 
     def cost(self, act: Callable[[Tensor, Tensor, int], Tensor]) -> Tensor:
         """The cost of p = act(e, e', k) at step k."""
@@ -125,6 +127,13 @@ def improve(
     s = (y, int y), (..., n, 2), to (..., n); `gains` are K_p and K_d, `updates` Adam's, of step
     `rate`. Returns the cost before each update, and after the last.
     """
+    refuse_uncallable("signal", signal)
+    if not isinstance(policy, nn.Module) or not isinstance(trial, Trial):
+        raise TypeError(
+            f"policy needs a torch module and trial a Trial, got {policy!r:.60}, {trial!r:.60}"
+        )
+    checked("gains", gains, "2")
+    updates, rate = count("updates", updates), number("rate", rate, above=0.0)
     parts = [part for part in (signal, policy) if isinstance(part, nn.Module)]
     optimiser = torch.optim.Adam([p for part in parts for p in part.parameters()], lr=rate)
     integral = torch.zeros(())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from itertools import chain
 from typing import Any
@@ -11,7 +12,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from cmc.policies.stacked import SignalNetwork, tanh
+from cmc.policies.stacked import SignalNetwork, check_tensor, tanh
+from cmc.theory.arrays import checked
 
 Array = NDArray[np.float64]
 Real = NDArray[np.floating]
@@ -54,32 +56,42 @@ class ModularPolicy(nn.Module):
         squash: bool = False,
     ) -> None:
         super().__init__()
+        _check_module("network", network, "n")
         self.network, self.normalise, self.integral = network, normalise, integral
         self.squash = squash
         self.n = int(network.n)  # type: ignore[arg-type]
+        if not (layout is None or isinstance(layout, Mapping)):
+            raise TypeError(f"layout needs a mapping of names to slices, got {layout!r:.60}")
         self.layout = {"s": slice(0, 2 * self.n)} if layout is None else dict(layout)
-        signals = set(self.layout) - {"R", "T_a"}
+        parts = self.layout.values()
+        signals = set(self.layout) - {"R", "T_a"} if all(isinstance(p, slice) for p in parts) else 0
         if signals not in ({"s"}, {"z", "integral"}):
             raise ValueError(
-                "wanted a layout of 's' (or 'z' and 'integral'), 'R' and 'T_a'; "
-                f"got {sorted(self.layout)}"
+                "layout needs slices for 's' (or 'z' and 'integral'), 'R' and 'T_a'; "
+                f"got {self.layout}"
             )
         dtype = _dtype(network)
         self.register_buffer("u0", _vector("u0", u0, self.n, dtype), persistent=False)
         self.register_buffer("R", _vector("R", R, self.n, dtype), persistent=False)
         if not bool((self.R != 0).all()):
-            raise ValueError(f"wanted no zero on the diagonal of R; got {R!r}")
+            raise ValueError(f"R needs a diagonal without zeros, got {R!r:.60}")
 
     def signals(self, observation: Any) -> Any:
         """The signals s (..., n, 2) that an observation (..., d) holds; torch or numpy."""
-        if "s" in self.layout:
-            s = observation[..., self.layout["s"]]
-            return s.reshape(*s.shape[:-1], self.n, 2)
-        parts = [observation[..., self.layout[name]] for name in ("z", "integral")]
+        names = ("s",) if "s" in self.layout else ("z", "integral")
+        parts = [observation[..., self.layout[name]] for name in names] if observation.ndim else []
+        if not parts or any(part.shape[-1] != 2 * self.n // len(names) for part in parts):
+            raise ValueError(
+                f"observation needs shape (..., d) with {' and '.join(names)} at "
+                f"{[self.layout[name] for name in names]}, got {tuple(observation.shape)}"
+            )
+        if len(parts) == 1:
+            return parts[0].reshape(*parts[0].shape[:-1], self.n, 2)
         return torch.stack(parts, -1) if isinstance(observation, Tensor) else np.stack(parts, -1)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the command (..., n) for an observation (..., d) laid out as `layout` says."""
+        check_tensor("observation", observation)
         s = self.signals(observation)
         R = observation[..., self.layout["R"]] if "R" in self.layout else self.R
         if "T_a" not in self.layout:
@@ -89,15 +101,19 @@ class ModularPolicy(nn.Module):
 
     def command(self, s: Tensor, R: Tensor, T_a: Tensor | None = None) -> Tensor:
         """Return u = u0 + T_a a from s (..., n, 2), diag(R) (..., n) and T_a (..., n, n)."""
+        check_tensor("s", s)
+        check_tensor("R", R, self.n)
         factor = 1.0 / R if self.normalise else torch.sign(R)
         pi = self.network(self._visible(s))
         pi = tanh(pi) if self.squash else pi
         if T_a is None:
             return torch.addcmul(self.u0, factor, pi, value=-1.0)  # constraint_sign
+        check_tensor("T_a", T_a, self.n, self.n)
         return self.u0 - (T_a * (factor * pi).unsqueeze(-2)).sum(-1)  # constraint_sign
 
     def jacobian(self, s: Tensor) -> Tensor:
         """Own slopes d pi_i / d s_ij of the network, before the sign rule, (..., n, 2)."""
+        check_tensor("s", s)
         slope = self.network.jacobian(self._visible(s))  # type: ignore[operator]
         if slope.ndim > s.ndim:  # a full matrix (..., i, k, j)
             slope = torch.diagonal(slope, dim1=-3, dim2=-2).transpose(-1, -2)
@@ -134,6 +150,9 @@ class DirectPolicy(nn.Module):
         squash: bool = False,
     ) -> None:
         super().__init__()
+        _check_module("network", network, "n")
+        if not isinstance(part, slice):
+            raise TypeError(f"part needs a slice of the observation, got {part!r:.60}")
         self.network, self.part, self.squash = network, part, squash
         self.n = int(network.n)  # type: ignore[arg-type]
         self.register_buffer("u0", _vector("u0", u0, self.n, _dtype(network)), persistent=False)
@@ -152,14 +171,20 @@ class DirectPolicy(nn.Module):
         return self.network(self.signals(observation))
 
 
+def _check_module(name: str, module: Any, *attributes: str) -> None:
+    if not isinstance(module, nn.Module) or not all(hasattr(module, a) for a in attributes):
+        wish = f" with {attributes[0]}" if attributes else ""
+        raise TypeError(f"{name} needs a torch module{wish}, got {module!r:.60}")
+
+
 def _dtype(module: nn.Module) -> torch.dtype:
     return next(chain(module.parameters(), module.buffers())).dtype
 
 
 def _vector(name: str, value: ArrayLike, n: int, dtype: torch.dtype) -> Tensor:
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape not in ((), (1,), (n,)) or not np.isfinite(array).all():
-        raise ValueError(f"wanted {name} finite, a number or ({n},); got {value!r}")
+    array = checked(name, value)
+    if array.shape not in ((), (1,), (n,)):
+        raise ValueError(f"{name} needs a number or shape ({n},), got shape {array.shape}")
     return torch.as_tensor(np.broadcast_to(array, (n,)).copy(), dtype=dtype)
 
 
@@ -170,14 +195,15 @@ def as_numpy(policy: nn.Module) -> Function:
     observation that is not finite. Stacked tanh networks run in numpy, which for the few rows of a
     control step costs a fifth of a call into torch; any other policy runs in torch.
     """
+    _check_module("policy", policy)
+    if any(part.device.type != "cpu" for part in chain(policy.parameters(), policy.buffers())):
+        policy = copy.deepcopy(policy).cpu()
     dtype = torch.empty(0, dtype=_dtype(policy)).numpy().dtype
     run = _in_numpy(policy) or _in_torch(policy)
 
     def act(observation: Real) -> Real:
-        observation = np.asarray(observation, dtype=dtype)
-        if not np.isfinite(observation).all():
-            raise ValueError("wanted finite observations; got NaN or infinity")
-        return run(observation)
+        found = checked("observation", observation, "... d")
+        return run(found.astype(dtype, copy=False))
 
     return act
 

@@ -10,8 +10,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from cmc.policies.stacked import SignalNetwork, StackedMLP
-from cmc.theory.arrays import checked
+from cmc.policies.stacked import SignalNetwork, StackedMLP, check_seeds, check_signals
+from cmc.theory.arrays import checked, count
 
 Array = NDArray[np.float64]
 
@@ -40,9 +40,6 @@ class PositiveNetwork(SignalNetwork):
         slope_max: M > m, broadcast to (n, 2), or None for no cap.
         joint_cap: pair (v, limit), v >= 0 broadcast to (n, 2) and limit > 0 broadcast to (n,):
             the cap v . slope <= limit, such as the sampled-data bound with v = (1, h/2).
-
-    Raises:
-        ValueError: for bounds that are not finite, negative, or leave no room for the network.
     """
 
     slope_min: Tensor
@@ -61,22 +58,29 @@ class PositiveNetwork(SignalNetwork):
         joint_cap: tuple[ArrayLike, ArrayLike] | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        sizes: dict[str, Any] = {"copies": n, "seeds": seeds, "bias": bias, "dtype": dtype}
+        sizes: dict[str, Any] = {
+            "copies": count("n", n),
+            "seeds": seeds,
+            "bias": bias,
+            "dtype": dtype,
+        }
         super().__init__(n, StackedMLP(2, 1, hidden, start="positive", **sizes))
         low = _bound("slope_min", slope_min, (n, 2))
         room = joint = None
         if slope_max is not None:
             high = _bound("slope_max", slope_max, (n, 2))
             if not (high > low).all():
-                raise ValueError(f"wanted slope_max above slope_min; got {high} and {low}")
+                raise ValueError(f"slope_max needs values above slope_min; got {high} and {low}")
             room = high - low
         if joint_cap is not None:
-            weight = _bound("joint cap weights", joint_cap[0], (n, 2))
-            limit = _bound("joint cap limit", joint_cap[1], (n,))
+            if not isinstance(joint_cap, (list, tuple)) or len(joint_cap) != 2:
+                raise ValueError(f"joint_cap needs a pair (weights, limit), got {joint_cap!r:.60}")
+            weight = _bound("joint_cap weights", joint_cap[0], (n, 2))
+            limit = _bound("joint_cap limit", joint_cap[1], (n,))
             left = limit - (weight * low).sum(-1)
             if not ((left > 0).all() and (weight.sum(-1) > 0).all()):
                 raise ValueError(
-                    f"the joint cap {limit} leaves no room above slope_min {low} "
+                    f"joint_cap {limit} leaves no room above slope_min {low} "
                     f"for the weights {weight}"
                 )
             joint = weight / left[:, None]  # v . P / left <= 1
@@ -120,8 +124,8 @@ class PositiveNetwork(SignalNetwork):
         The lower end of an uncapped, bypass-free network is 0 and is only approached.
         """
         with torch.no_grad():
-            low = self.slope_min.double().numpy()
-            high = _product([weight.double() for weight in self.used_weights()]).numpy()
+            low = self.slope_min.double().cpu().numpy()
+            high = _product([weight.double() for weight in self.used_weights()]).cpu().numpy()
         high = high.reshape(*([self.seeds] if self.seeds else []), self.n, 2) + low
         return np.broadcast_to(low, high.shape).copy(), high
 
@@ -137,20 +141,22 @@ class LinearNetwork(nn.Module):
     def __init__(self, gains: ArrayLike, seeds: Sequence[int] | None = None) -> None:
         super().__init__()
         found = torch.as_tensor(checked("gains", gains, "n 2").astype(np.float32))
-        self.n, self.seeds = len(found), None if seeds is None else len(seeds)
+        self.n, self.seeds = len(found), len(check_seeds(seeds) or ()) or None
         self.register_buffer("gains", found, persistent=False)
 
     def forward(self, s: Tensor) -> Tensor:
         """Evaluate: s (..., n, 2) to (..., n)."""
+        check_signals(s, self.n, self.seeds)
         return (self.gains * s).sum(-1)
 
     def jacobian(self, s: Tensor) -> Tensor:
         """The gains, repeated over the batch: (..., n, 2)."""
+        check_signals(s, self.n, self.seeds)
         return self.gains.expand(s.shape)
 
     def slope_bounds(self) -> tuple[Array, Array]:
         """The gains are both bounds, ([seeds,] n, 2) each."""
-        gains = np.tile(self.gains.double().numpy(), (self.seeds, 1, 1) if self.seeds else 1)
+        gains = np.tile(self.gains.double().cpu().numpy(), (self.seeds, 1, 1) if self.seeds else 1)
         return gains, gains.copy()
 
 
@@ -163,14 +169,11 @@ def _product(weights: Sequence[Tensor]) -> Tensor:
 
 
 def _bound(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = np.asarray(value, dtype=np.float64)
+    array = checked(name, value, least=0.0)
     try:
-        array = np.broadcast_to(array, shape).copy()
-    except ValueError as error:
-        raise ValueError(f"wanted {name} of shape {shape}; got {array.shape}") from error
-    if not np.isfinite(array).all() or (array < 0).any():
-        raise ValueError(f"wanted {name} finite and not negative; got {array}")
-    return array
+        return np.broadcast_to(array, shape).copy()
+    except ValueError:
+        raise ValueError(f"{name} needs shape {shape}, got {array.shape}") from None
 
 
 def _export_positive(module: nn.Module, state: dict[str, Any], prefix: str, *_rest: Any) -> None:

@@ -10,7 +10,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from cmc.policies.stacked import SignalNetwork, StackedMLP, check_seeds, check_signals, tanh
+from cmc.policies.stacked import (
+    SignalNetwork,
+    StackedMLP,
+    check_seeds,
+    check_signals,
+    check_tensor,
+    tanh,
+)
+from cmc.theory.arrays import count, number
 
 Array = NDArray[np.float64]
 
@@ -26,6 +34,7 @@ class IndependentNetwork(SignalNetwork):
         seeds: Sequence[int] | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
+        n = count("n", n)
         super().__init__(n, StackedMLP(2, 1, hidden, copies=n, seeds=seeds, last=0.1, dtype=dtype))
 
 
@@ -45,6 +54,7 @@ class JointNetwork(SignalNetwork):
         last: float = 0.1,
         dtype: torch.dtype = torch.float32,
     ) -> None:
+        n = count("n", n)
         self.inputs = 2 * n if inputs is None else inputs
         self._axes = 2 if inputs is None else 1  # of an input
         mlp = StackedMLP(self.inputs, n, hidden, seeds=seeds, last=last, dtype=dtype)
@@ -52,11 +62,13 @@ class JointNetwork(SignalNetwork):
 
     def inputs_of(self, s: Any) -> Any:
         """Signals (..., n, 2), or flat inputs (..., inputs), to (seeds, batch, inputs)."""
-        count, size = self.seeds or 1, int(np.prod(s.shape[-self._axes :]))
-        if size != self.inputs or (self.seeds is not None and s.shape[0] != count):
-            lead = "" if self.seeds is None else f"{count} seeds, "
-            raise ValueError(f"wanted ({lead}..., {self.inputs}) flat inputs; got {tuple(s.shape)}")
-        return s.reshape(count, -1, self.inputs)
+        stack, size = self.seeds or 1, int(np.prod(s.shape[-self._axes :]))
+        if size != self.inputs or (self.seeds is not None and s.shape[0] != stack):
+            lead = "" if self.seeds is None else f"{stack} seeds, "
+            raise ValueError(
+                f"s needs ({lead}..., {self.inputs}) flat inputs; got {tuple(s.shape)}"
+            )
+        return s.reshape(stack, -1, self.inputs)
 
     def outputs_of(self, out: Any, s: Any) -> Any:
         """What the network answers, (seeds, batch, n), to (..., n)."""
@@ -64,6 +76,7 @@ class JointNetwork(SignalNetwork):
 
     def jacobian(self, s: Tensor) -> Tensor:
         """Slopes d pi_i / d s_ij of each output in its own signals: s (..., n, 2) to the same."""
+        check_tensor("s", s)
         with torch.enable_grad():
             s = s.detach().requires_grad_(True)
             out = self(s)
@@ -97,8 +110,7 @@ class ConvexGradientNetwork(nn.Module):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
-        if n < 1 or hidden < 1 or not mu > 0:
-            raise ValueError(f"wanted n, hidden >= 1 and mu > 0; got {n}, {hidden}, {mu}")
+        n, hidden, mu = count("n", n), count("hidden", hidden), number("mu", mu, above=0.0)
         self.n, self.mu = n, mu
         checked = check_seeds(seeds)
         self.seeds = None if checked is None else len(checked)
@@ -113,6 +125,7 @@ class ConvexGradientNetwork(nn.Module):
 
     def _stacked(self, s: Tensor) -> Tensor:
         """Move s ([seeds,] ..., n, 2) to (seeds * 2, batch, n): one row for each term."""
+        check_tensor("s", s)
         check_signals(s, self.n, self.seeds)
         x = s.reshape(self.seeds or 1, -1, self.n, 2)
         return x.permute(0, 3, 1, 2).reshape(-1, x.shape[1], self.n)
@@ -137,7 +150,7 @@ class ConvexGradientNetwork(nn.Module):
     def slope_bounds(self) -> tuple[Array, Array]:
         """Guaranteed interval of the diagonal slopes d pi_i / d s_ij, ([seeds,] n, 2) each."""
         with torch.no_grad():
-            W, a = self.W.double(), self.a.abs().double()
+            W, a = self.W.double().cpu(), self.a.abs().double().cpu()
             high = (a * W * W).sum(-1).reshape(-1, 2, self.n).transpose(1, 2).numpy() + self.mu
         high = high[0] if self.seeds is None else high
         return np.full_like(high, self.mu), high

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+
+from cmc.theory.arrays import count, number
 
 Start = Literal["positive", "signed"]
 NARROW = 16
@@ -18,10 +20,26 @@ def check_seeds(seeds: Sequence[int] | None) -> tuple[int, ...] | None:
     """The seeds as a tuple, or None for one network without a leading axis."""
     if seeds is None:
         return None
-    seeds = tuple(int(seed) for seed in seeds)
-    if not seeds or min(seeds) < 0:
-        raise ValueError(f"wanted at least one seed, none of them negative; got {seeds}")
-    return seeds
+    found = seeds if isinstance(seeds, (Sequence, np.ndarray)) else ()
+    if not len(found) or not all(isinstance(s, (int, np.integer)) and s >= 0 for s in found):
+        raise ValueError(f"seeds needs whole numbers, at least one, from 0 on; got {seeds!r:.60}")
+    return tuple(int(seed) for seed in found)
+
+
+def check_hidden(hidden: Sequence[int]) -> tuple[int, ...]:
+    """Sizes of the hidden layers, at least one."""
+    if not isinstance(hidden, (list, tuple)) or not hidden:
+        raise ValueError(f"hidden needs a size for each layer, at least one; got {hidden!r:.60}")
+    return tuple(count("hidden", size) for size in hidden)
+
+
+def check_tensor(name: str, value: Any, *tail: int) -> None:
+    """Refuse what is no tensor of floats of shape (..., *tail)."""
+    if not isinstance(value, Tensor) or not value.is_floating_point():
+        raise TypeError(f"{name} needs a tensor of floats, got {value!r:.60}")
+    if tail and tuple(value.shape[-len(tail) :]) != tail:
+        wish = ", ".join(str(size) for size in tail)
+        raise ValueError(f"{name} needs shape (..., {wish}), got {tuple(value.shape)}")
 
 
 class StackedMLP(nn.Module):
@@ -55,11 +73,12 @@ class StackedMLP(nn.Module):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
-        sizes = (inputs, *hidden, outputs)
-        if len(sizes) < 3 or min(sizes) < 1 or copies < 1:
+        sizes = (count("inputs", inputs), *check_hidden(hidden), count("outputs", outputs))
+        copies, last = count("copies", copies), number("last", last)
+        if not (isinstance(bias, bool) and isinstance(start, str) and start in get_args(Start)):
             raise ValueError(
-                "wanted positive sizes and at least one hidden layer; got "
-                f"inputs {inputs}, hidden {tuple(hidden)}, outputs {outputs}, copies {copies}"
+                f"bias needs True or False, start one of {get_args(Start)}; "
+                f"got bias = {bias!r:.60}, start = {start!r:.60}"
             )
         self.seeds = check_seeds(seeds)
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
@@ -168,12 +187,13 @@ def _parameter(rows: Any, dtype: torch.dtype) -> nn.Parameter:
 
 def check_signals(s: Any, n: int, seeds: int | None) -> None:
     """Refuse signals that are not (..., n, 2), or (seeds, ..., n, 2) where there are seeds."""
-    if s.ndim < 2 or tuple(s.shape[-2:]) != (n, 2):
+    if not isinstance(s, np.ndarray):
+        check_tensor("s", s)
+    lead = "" if seeds is None else f"{seeds} seeds, "
+    if tuple(s.shape[-2:]) != (n, 2) or (seeds is not None and (s.ndim < 3 or len(s) != seeds)):
         raise ValueError(
-            f"wanted s of shape (..., {n}, 2) holding (z, integral of z); got {tuple(s.shape)}"
+            f"s needs shape ({lead}..., {n}, 2), (z, integral of z); got {tuple(s.shape)}"
         )
-    if seeds is not None and (s.ndim < 3 or s.shape[0] != seeds):
-        raise ValueError(f"wanted a leading axis of {seeds} seeds; got shape {tuple(s.shape)}")
 
 
 class SignalNetwork(nn.Module):
@@ -184,7 +204,7 @@ class SignalNetwork(nn.Module):
 
     def __init__(self, n: int, mlp: StackedMLP) -> None:
         super().__init__()
-        self.n, self.mlp = n, mlp
+        self.n, self.mlp = count("n", n), mlp
         self.seeds = None if mlp.seeds is None else len(mlp.seeds)
 
     def used_weights(self) -> list[Tensor]:
@@ -207,10 +227,12 @@ class SignalNetwork(nn.Module):
 
     def forward(self, s: Tensor) -> Tensor:
         """Evaluate the networks: s (..., n, 2) to (..., n)."""
+        check_tensor("s", s)
         return self.outputs_of(self.mlp.run(self.inputs_of(s), self.used_weights()), s)
 
     def jacobian(self, s: Tensor) -> Tensor:
         """Slopes d pi_i / d s_ij in closed form (`product`): s (..., n, 2) to (..., n, 2)."""
+        check_tensor("s", s)
         return self._back(self.mlp.slopes(self.inputs_of(s), self.used_weights()), s)
 
 
@@ -238,6 +260,7 @@ def tanh(x: Tensor) -> Tensor:
     On the CPU numpy computes the values (its vector code is several times faster than torch's);
     elsewhere, and for types that numpy lacks, this is `torch.tanh`.
     """
+    check_tensor("x", x)
     if x.device.type != "cpu" or x.dtype not in (torch.float32, torch.float64):
         return torch.tanh(x)
     if x.requires_grad and torch.is_grad_enabled():

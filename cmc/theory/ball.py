@@ -7,6 +7,7 @@ at, and if no command is clipped in it. Under a hold that is said of the samples
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -103,24 +104,49 @@ def ball_in_box(
     caution, rest = "nothing says that they do", rest_point(loop, keep)
     if rest is None:
         return replace(answer, reason=f"{answer.reason} ({caution}: no point of rest was found)")
-    n, m, spread = loop.n, len(keep), _spread_of(answer)
+    n, m, spread, limits = loop.n, len(keep), _spread_of(answer), _limits(loop.plant)
     room = np.minimum(rest - low, high - rest)[keep] / np.linalg.norm(spread, axis=1)
-    radius, limits, rng = float(room.min()), _limits(loop.plant), np.random.default_rng(3)
-    if radius > 0:
-        x = rng.normal(size=(_SAMPLES, m))
-        x *= rng.uniform(0, 1, (_SAMPLES, 1)) ** 0.2 / np.linalg.norm(x, axis=1, keepdims=True)
-        for _ in range(30):
-            s = np.broadcast_to(rest, (_SAMPLES, 2 * n)).copy()
-            s[:, keep] += radius * x @ spread.T
-            z, u = loop.signals(s[:, :n], s[:, n:])
-            if h is not None:
-                u = loop.signals(s[:, :n], s[:, n:] + h * z, z=z)[1]
-            if (u >= limits[0]).all() and (u <= limits[1]).all():
-                break
-            radius *= 0.8
-        else:
-            radius = 0.0
-    return _noted(replace(answer, rest=rest[keep]), 0.9 * radius, caution)
+    radius = 0.99 * float(room.min())  # rest itself is not exact
+
+    def left(x: Array) -> Array:
+        """How far the commands are from the plant's limits, (N,)."""
+        s = np.broadcast_to(rest, (len(x), 2 * n)).copy()
+        s[:, keep] += radius * x @ spread.T
+        z, u = loop.signals(s[:, :n], s[:, n:])
+        if h is not None:
+            u = loop.signals(s[:, :n], s[:, n:] + h * z, z=z)[1]
+        return np.asarray(np.minimum(u - limits[0], limits[1] - u).min(axis=-1))
+
+    start = _in_ball(np.random.default_rng(3).normal(size=(_SAMPLES, m)))
+    while radius > 0 and np.isfinite(limits).any():
+        _, found, margin = lowest(left, start, _in_ball, np.full(m, 0.3))
+        if found.min() > margin:
+            break
+        radius = 0.8 * radius if radius > 1e-3 * room.min() else 0.0
+    return _noted(replace(answer, rest=rest[keep]), radius, caution)
+
+
+def _in_ball(x: Array) -> Array:
+    return np.asarray(x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1.0))
+
+
+def lowest(
+    value: Callable[[Array], Array], points: Array, place: Callable[[Array], Array], width: Array
+) -> tuple[Array, Array, float]:
+    """Go downhill from the lowest of some points (N, m), in clouds half as wide as the one before.
+
+    `place` brings points back to where they may be. Returns all points, their values, (N,), and by
+    how much the last three clouds lowered the smallest. A value that bends evenly, or has a kink,
+    is lowered less by all clouds that could follow: that much is left as a margin.
+    """
+    rng, values, smallest = np.random.default_rng(0), value(points), []
+    for k in range(5):
+        smallest.append(values.min())
+        near = points[np.argsort(values)[:32]]
+        cloud = near + rng.normal(size=(8, *near.shape)) * width / 2**k
+        cloud = place(cloud.reshape(-1, near.shape[-1]))
+        points, values = np.concatenate([points, cloud]), np.concatenate([values, value(cloud)])
+    return points, values, float(smallest[-3] - values.min())
 
 
 def _spread_of(answer: Certificate) -> Array:

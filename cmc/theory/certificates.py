@@ -99,11 +99,7 @@ def circle_criterion(c: float, k1: float, k2: float) -> Certificate:
     A common quadratic metric exists if and only if 0 < k1 and sqrt(k2) - sqrt(k1) < c. It can be
     written down: M = [[1, c/2], [c/2, c^2/2 + sqrt(k1 k2)]] in (z, int z). For a rate beta apply
     the same to e^{beta t} w, with damping c - 2 beta and stiffness k - beta c + beta^2.
-
-    Args:
-        c: Damping -(Lambda + R p), 1/s.
-        k1: Smallest stiffness -R q, 1/s^2.
-        k2: Largest stiffness, 1/s^2.
+    Here c = -(Lambda + R p) in 1/s; k1 and k2 are the ends of -R q in 1/s^2.
     """
     c, k1, k2 = number("c", c), number("k1", k1), number("k2", k2)
     if k1 > k2 or max(abs(c), abs(k1), abs(k2)) > 1e150:

@@ -201,9 +201,6 @@ def transforms_that_fit(plant: Any) -> tuple[Possibility, ...]:
 
     Looked at on 200 random points of the box, at the commands that hold them.
 
-    Args:
-        plant: Has `n`, `f`, `f_y`, `f_u`, `y_low`, `y_high`, `constant`.
-
     Returns:
         own order, reversed order: T_y is the identity or turns the order round, where f_y and f_u
         are triangular as they are. eigenvectors at every state: the explicit solution, followed

@@ -71,7 +71,7 @@ class CompositeModel:
     @property
     def f_y(self) -> Array:
         """Latent Jacobian df/dy = -B_lat / A_lat, negative, 1/s (`LTI`)."""
-        return -self.B_lat / self.A_lat
+        return -self.latent_rate
 
     @property
     def f_u(self) -> Array:
@@ -106,16 +106,9 @@ def composite(
     B_lat = lambda_d and A_lat = lambda_d / K2 (`lambda_b_2`). Where K_p = 0: y = e', A_lat =
     lambda_d, B_lat = K_d (`lambda_b_1`).
 
-    Args:
-        K_p: stiffness gains >= 0, broadcastable to (...,).
-        K_d: damping gains > 0.
-        lambda_d: inertia-like coefficient > 0; 1 for acceleration-based control.
-        root: "small" takes the paper's plus sign (smaller K2: y is mostly position, the fast pole
-            is the composition, the slow one latent); "large" the minus sign (larger K2: the fast
-            pole is latent).
-
-    Raises:
-        InfeasibleGainsError: where K_d^2 < 4 K_p lambda_d.
+    K_p >= 0, K_d > 0 and lambda_d > 0 (1 for acceleration-based control) broadcast to (...,). The
+    root "small" takes the paper's plus sign (smaller K2: y is mostly position, the fast pole is the
+    composition, the slow one latent), "large" the minus sign (larger K2: the fast pole is latent).
     """
     if not isinstance(root, str) or root not in ("small", "large"):
         raise ValueError(f"root must be 'small' or 'large', got {root!r}")
@@ -169,18 +162,10 @@ def certify_latent(
     proves contraction for every signal and policy within the intervals, everywhere. With `h` the
     whole command is held, I_k = I_{k-1} + h y_k, and the step is multi-affine as well.
 
-    Args:
-        signal: Has `slope_bounds() -> (lower, upper)`, slopes in (e, e'), (n, 2), positive; a
-            `CompositeModel` is the hand-made one.
-        policy: Has `slope_bounds()`, slopes of u in (y, int y), (n, 2); without integral where the
-            second are zero.
-        K_p: Stiffness gains, broadcast to (n,) like K_d and lambda_d.
-        K_d: Damping gains.
-        lambda_d: Coefficient of e'', positive.
-        h: Sample time, s.
-
-    Returns:
-        A certificate in (e_1, e_1', int y_1, e_2, ...), the rate that of the slowest axis.
+    `slope_bounds() -> (lower, upper)` gives slopes of the signal in (e, e'), (n, 2), positive (a
+    `CompositeModel` is the hand-made one), and of the policy's u in (y, int y), the second zero
+    without integral; gains broadcast to (n,), h in s. The certificate is in (e_1, e_1', int y_1,
+    e_2, ...), its rate that of the slowest axis.
     """
     low, high = _slopes("signal", signal)
     least, most = _slopes("policy", policy, n=len(low))

@@ -1,10 +1,11 @@
-"""Contraction: the differential dynamics in the auxiliary space, and rates in a metric.
+"""Contraction: the differential dynamics in the auxiliary space, rates in a metric, both theorems.
 
 With `a = pi(z, int z)` one network a dimension, `d/dt (dz, da) = F (dz, da)`. Throughout, `slopes`
 has shape (..., n, 2) and holds d pi_i / d s_1i (towards z_i) and d pi_i / d s_2i (towards int z_i),
 signs included, and `T_y_dot` is the time derivative of T_y [1/s], (..., n, n). The change of the
-slopes themselves is dropped, as in the paper: what F says is about one frozen instant;
-`cmc.theory.certificates` says when instants add up to a guarantee.
+slopes themselves is dropped, as in the paper: what F says is about one frozen instant, and so do
+the margins of theorem 1 (F1_theorem1, on the symmetric part of F1) and of theorem 2 (eq_theorem2,
+two signs a module); `cmc.theory.certificates` says when instants add up to a guarantee.
 
 A system contracts at `rate` > 0 if the distance of any two trajectories obeys
 
@@ -45,8 +46,9 @@ def blocks(space: AuxiliarySpace, slopes: ArrayLike, T_y_dot: ArrayLike | None =
     s = checked("slopes", slopes, "... n 2", n=space.n)
     A_blk, B_blk = space.Lambda, space.R
     if T_y_dot is not None:
-        rate, frozen = together(T_y_dot=_frame_rate(space, T_y_dot), space=A_blk)
-        A_blk = rate + frozen
+        dot = checked("T_y_dot", T_y_dot, "... n n", n=space.n)
+        dot, V, A_blk = together(T_y_dot=dot, V=space.V, space=A_blk)
+        A_blk = dot @ V + A_blk
     A_blk, B_blk, pi_1 = together(T_y_dot=A_blk, space=B_blk, slopes=s[..., 0, None])
     C_blk, D_blk = pi_1 * A_blk + s[..., 1, None] * np.eye(space.n), pi_1 * B_blk
     not_overflown("slopes and T_y_dot", A_blk, C_blk, D_blk)
@@ -64,17 +66,7 @@ def F(space: AuxiliarySpace, slopes: ArrayLike, T_y_dot: ArrayLike | None = None
 
 def F2(space: AuxiliarySpace, slopes: ArrayLike, T_y_dot: ArrayLike) -> Array:
     """Return the part of F that the moving transform adds, F - F_1 (F2), (..., 2n, 2n)."""
-    pi_1 = checked("slopes", slopes, "... n 2", n=space.n)[..., 0, None]
-    left, pi_1 = together(T_y_dot=_frame_rate(space, T_y_dot), slopes=pi_1)
-    zero = np.zeros(left.shape)
-    not_overflown("slopes and T_y_dot", left, pi_1 * left)
-    return np.block([[left, zero], [pi_1 * left, zero]])
-
-
-def _frame_rate(space: AuxiliarySpace, T_y_dot: ArrayLike) -> Array:
-    """T_y' T_y^-1 [1/s]."""
-    dot = checked("T_y_dot", T_y_dot, "... n n", n=space.n)
-    return np.matmul(*together(T_y_dot=dot, space=space.V))
+    return F(space, slopes, T_y_dot) - F(space, slopes)
 
 
 def Theta_M(space: AuxiliarySpace) -> Array:
@@ -155,3 +147,54 @@ def lyapunov_metric(J: ArrayLike, rate: float = 0.0) -> Array:
 def overshoot(metric: ArrayLike) -> Array:
     """Bound on the Euclidean transient that a metric allows: sqrt(cond(M)), (...,)."""
     return np.linalg.cond(metric_factor(metric))
+
+
+def _asked(space: AuxiliarySpace) -> None:
+    """Refuse what is no space, where a margin is asked for."""
+    if not isinstance(space, AuxiliarySpace):
+        raise TypeError(f"space needs an AuxiliarySpace, got {type(space).__name__}")
+
+
+def theorem1_margin(
+    space: AuxiliarySpace, slopes: ArrayLike, T_y_dot: ArrayLike | None = None
+) -> Array:
+    """Return the contraction rate beta that theorem 1 guarantees [1/s], shape (...).
+
+    `beta = -(lmax(F1) + max(lmax(F2), 0))`, lmax the largest eigenvalue of the symmetric part
+    `(M + M^T)/2`; positive means that distances in (z, a) shrink at least as exp(-beta t).
+    The theorem's text compares `F1^T + F1`, without the half, with beta, and its proof halves it:
+    they differ by a factor 2. The proof's convention is used here, because only there beta is the
+    rate; the text's beta is twice this number.
+    """
+    _asked(space)
+    margin = contraction_rate(F(space, slopes))  # F1_theorem1
+    if T_y_dot is not None:
+        margin = margin + np.minimum(contraction_rate(F2(space, slopes, T_y_dot)), 0.0)
+    return margin
+
+
+def theorem2_margin(space: AuxiliarySpace, slopes: ArrayLike) -> Array:
+    """Return by how much theorem 2's inequalities hold [1/s], (..., n, 2); alpha is the least.
+
+    `-(Lambda_ii + R_ii d pi_i/d s_1i)` and `-R_ii d pi_i/d s_2i`: trace (negated) and determinant
+    of the module's F_ii, both positive where its eigenvalues have negative real part. A positive
+    alpha is not a rate: trace -1e4 with determinant 1 decays at 1e-4.
+    """
+    _asked(space)
+    s = checked("slopes", slopes, "... n 2", n=space.n)
+    first = -(space.eigenvalues + space.gains * s[..., 0])  # eq_theorem2
+    return np.stack(np.broadcast_arrays(first, -space.gains * s[..., 1]), axis=-1)
+
+
+def slope_floor(space: AuxiliarySpace, alpha: float = 0.0) -> Array:
+    """Return how steep each policy must be in z_i, (..., n): `|d pi_i/d s_1i| > floor`.
+
+    `max(0, (Lambda_ii + alpha) / |R_ii|)` for a margin alpha [1/s]: zero for a stable mode, where
+    the right sign is enough; an open-loop unstable one (Lambda_ii >= 0) needs a slope that does not
+    vanish by saturation.
+    """
+    alpha = number("alpha", alpha, least=0.0)
+    _asked(space)
+    if np.any(space.gains == 0.0):
+        raise ValueError("R has a zero on its diagonal: no slope helps that module")
+    return np.maximum(space.eigenvalues + alpha, 0.0) / np.abs(space.gains)

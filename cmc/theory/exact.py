@@ -1,4 +1,4 @@
-"""Exact certificates: the total Jacobian of the loop in (y, int z), nothing held constant.
+"""Exact certificates in a box: the total Jacobian of the loop in (y, int z), nothing held constant.
 
 With u = u0 + T_a(y) a, a = -sign(R) pi(z, I), z = T_y(y) (y - y_ref), I' = z, the Jacobian of the
 loop contains d(T_a)/dy a and d(T_y)/dy (y - y_ref), which the frozen analysis drops. They are taken
@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,16 +20,17 @@ from numpy.typing import ArrayLike
 
 from cmc.theory.arrays import Array, checked, count
 from cmc.theory.auxiliary import AuxiliarySpace
-from cmc.theory.ball import ball_in_box
+from cmc.theory.ball import ball_in_box, lowest
 from cmc.theory.certificates import Certificate, Progress, common_metric, rates_in
 from cmc.theory.identification import differences
 from cmc.theory.metric_search import search_metric
 from cmc.theory.simulate import Loop
 from cmc.theory.tracking import jumps
 
-_ROUNDS = 5
+_ROUNDS = 6
 _GRID = 1024
 _CHECKS = 2048
+_WORST = 40
 
 
 @dataclass(frozen=True)
@@ -40,9 +42,6 @@ class Region:
         y_high: Upper corner, (n,).
         integral: Largest |int z| per dimension, (n,) or one number.
         points: Grid points per axis of y, as long as there are not more than 1024.
-
-    Raises:
-        ValueError: if the corners are no box.
     """
 
     y_low: ArrayLike
@@ -103,85 +102,130 @@ def certify_exact(
 ) -> Certificate:
     """Exact certificate of one policy over a box of (y, int z); arguments as in `certify`.
 
-    One metric is sought for the total Jacobians at 1024 points or so, then tried at 2048 others and
-    around the worst of all; what fails joins the vertices, a few rounds at most. The metric is in
-    (y, int z), or in y alone where the policy does not use int z.
+    One metric is sought for the total Jacobians at some 3000 points, moved away from their mean by
+    the share that 2048 others lie beyond them, then tried downhill from the worst (`lowest`); what
+    fails joins them, a few rounds at most. The rate is that of the worst, less the margin that the
+    descent leaves and what rounding may hide. The metric is in (y, int z), or in y alone where the
+    policy does not use int z.
     """
     domain = "continuous" if h is None else "sampled"
     where = f"{region}, |int z| at most {np.asarray(region.integral).tolist()}"
-    n, (low, high) = plant.n, region.limits
+    n = plant.n
     try:
         if jumps(spaces, *region.corners):
             raise ValueError(
                 "T_y jumps inside the region (order or sign of its eigenvectors): track them along "
                 "the path, or shrink the region"
             )
-        loop = Loop(plant, policy, spaces, y_ref)
-        keep = np.arange(2 * n if _integrates(loop, low, high) else n)
-        look = _Looked(loop, keep, low, high, h, min(region.points, int(_GRID ** (1 / (2 * n)))))
-        answer, rates, points, jacobians = look.certificate(progress)
-        answer = replace(answer, evidence="points")
+        look = _Looked(Loop(plant, policy, spaces, y_ref), region, h)
+        answer, points, rates, margin = look.certificate(progress)
     except (ValueError, TypeError, np.linalg.LinAlgError) as error:
         return Certificate(False, "exact", domain, region=where, reason=str(error), refused=True)
-    if answer.metric is None or rates.min() <= 0:
-        k = int(np.argmin(rates))
-        reason = "metrics that fit the grid fail between" if answer.metric is not None else ""
-        at = f", at y = {_text(points[k, :n])}, int z = {_text(points[k, n:])}"
-        reason = (reason or answer.reason) + at + look.smaller()
+    answer = replace(answer, evidence="points", region=where)
+    worst, rate = int(np.argmin(rates)), float(rates.min()) - margin
+    if answer.metric is None or not rate > 0:
+        reason = (
+            answer.reason if answer.metric is None else "metrics that fit the grid fail between"
+        )
+        if look.beyond > 0:
+            reason += f" (Jacobians moved {100 * look.beyond:.2g} % outward for what lies between)"
+        s = points[worst]
+        reason += f", at y = {_text(s[:n])}, int z = {_text(s[n:])}{look.smaller()}"
         no = Certificate(False, "exact", domain, region=where, reason=reason, evidence="points")
-        return replace(no, violated=jacobians[k])
-    rate, seen = min(answer.rate, float(rates.min())), len(look.points) + len(points)
-    reason = f"one metric at all {seen} points of the box that were looked at, while the "
-    answer = replace(answer, rate=rate, region=where, reason=f"{reason}trajectories stay in it")
-    return ball_in_box(answer, loop, keep, low, high, h)
+        return replace(no, violated=look.at(s[None])[0])
+    reason = (
+        f"one metric at all {len(look.points) + len(points)} points of the box that were looked "
+        f"at, their Jacobians moved {100 * look.beyond:.2g} % away from the mean, as far as fresh "
+        "points were seen beyond them, while the trajectories stay in it"
+    )
+    answer = replace(answer, rate=min(answer.rate, rate), reason=reason)
+    return ball_in_box(answer, look.loop, look.keep, look.low, look.high, h)
+
+
+def shortfall(looked: Array, others: Array) -> float:
+    """By what share the hull of matrices (N, m, m) falls short of others, from 1000 directions."""
+    mean, size = looked.mean(axis=0), looked.std(axis=0)
+    size = np.where(size > 1e-6 * np.abs(looked).max(), size, np.inf)
+    ways = np.random.default_rng(4).normal(size=(mean.size, 1000))
+    seen, beyond = (
+        (((J - mean) / size).reshape(len(J), -1) @ ways).max(axis=0) for J in (looked, others)
+    )
+    return max(float(np.max(beyond / np.maximum(seen, 1e-300))) - 1.0, 0.0)
 
 
 class _Looked:
-    """Points of a box (y, int z), and the total Jacobians of a loop at them."""
+    """Points of a box (y, int z), and the total Jacobians of a loop at them.
 
-    def __init__(
-        self, loop: Loop, keep: Array, low: Array, high: Array, h: float | None, points: int
-    ) -> None:
-        self.keep, self.low, self.high, self.h = keep, low, high, h
-        self.move: Callable[[Array], Array] = (
-            (lambda x: loop.field(0.0, x)) if h is None else (lambda x: loop.step(x, h))
-        )
-        self.points = spread(low, high, points)
-        self.jacobians = self.at(self.points)
+    What lies between is answered for by a margin: other points tell by which share the hull of the
+    Jacobians may fall short (`beyond`), and all are moved away from their mean by as much. A metric
+    that fits them then fits the enlarged hull.
+    """
+
+    def __init__(self, loop: Loop, region: Region, h: float | None) -> None:
+        self.loop, self.h, (self.low, self.high) = loop, h, region.limits
+        self.step, n, rng = 1e-6 * (self.high - self.low), loop.n, np.random.default_rng(0)
+        grid = spread(self.low, self.high, min(region.points, int(_GRID ** (0.5 / n))))
+        others = rng.uniform(self.low, self.high, (2, _CHECKS, 2 * n))
+        points, self.keep = np.concatenate([grid, others[0]]), np.arange(2 * n)
+        whole = self.at(points)
+        if not whole[:, :n, n:].any():  # the command does not depend on int z
+            self.keep = np.arange(n)
+        at = self.keep[:, None], self.keep
+        looked, fresh = whole[:, at[0], at[1]], self.at(others[1])
+        self.beyond, self.mean = shortfall(looked, fresh), looked.mean(axis=0)
+        self.points = np.concatenate([points, others[1]])
+        self.jacobians = self.outward(np.concatenate([looked, fresh]))
+        # how far off a difference may be: rounding of the loop, and of the solver under a hold
+        size = (np.abs(whole) @ np.abs(points)[..., None]).max(axis=0)
+        size = size + np.abs(self.move(points)).max(axis=0)[:, None]
+        solved = 0.0 if h is None or loop.plant.constant else 1e-7
+        self.slack = (4e-16 / self.step * size + solved * np.abs(whole).max(axis=0))[at]
+
+    def move(self, s: Array) -> Array:
+        """The right-hand side, or the next sample."""
+        return self.loop.field(0.0, s) if self.h is None else self.loop.step(s, self.h)
 
     def at(self, s: Array) -> Array:
-        J = differences(self.move, s, 1e-6 * (self.high - self.low))
-        J = J[:, self.keep[:, None], self.keep]
-        bad = ~np.isfinite(J).all(axis=(1, 2))
+        """Total Jacobians (N, m, m) at states (N, 2n)."""
+        J = differences(self.move, s, self.step)
+        n, bad = self.loop.n, ~np.isfinite(J).all(axis=(1, 2))
         if bad.any():
-            where = _text(s[np.flatnonzero(bad)[0], : len(self.low) // 2])
-            raise ValueError(f"the loop is not finite at y = {where}")
-        return J
+            raise ValueError(f"the loop is not finite at y = {_text(s[np.argmax(bad), :n])}")
+        if len(self.keep) == n and J[:, :n, n:].any():
+            raise ValueError("the policy uses int z in a part of the box only")
+        return J[:, self.keep[:, None], self.keep]
 
-    def certificate(self, progress: Progress | None) -> tuple[Certificate, Array, Array, Array]:
-        """The best answer; rates, points and Jacobians that it was tried at, or what resists it."""
-        rng, low, high = np.random.default_rng(0), self.low, self.high
+    def outward(self, J: Array) -> Array:
+        """Jacobians moved away from their mean by the share that others may lie beyond them."""
+        return np.asarray(self.mean + (1 + self.beyond) * (J - self.mean))
+
+    def rates(self, metric: Array, s: Array) -> Array:
+        """Rates in a metric at states (N, 2n), lowered by what rounding may hide, (N,)."""
+        return rates_in(self.at(s), metric, self.h, self.slack)
+
+    def certificate(self, progress: Progress | None) -> tuple[Certificate, Array, Array, float]:
+        """The best answer, points it was tried at, their rates and a margin, or what resists it."""
         for turn in range(_ROUNDS):
             if progress is not None:
                 progress(f"box, round {turn + 1}: Jacobians at {len(self.points)} points")
-            answer = common_metric(self.jacobians, h=self.h, progress=progress)
-            if answer.metric is None:
-                assert answer.violated is not None
-                away = np.abs(self.jacobians - answer.violated).max(axis=(1, 2))
-                return answer, away, self.points, self.jacobians
-            worst = np.argsort(rates_in(self.jacobians, answer.metric, self.h))[:64]
-            near = self.points[worst]
-            around = near + rng.normal(size=(8, *near.shape)) * 0.05 * (high - low)
-            others = rng.uniform(low, high, (_CHECKS, len(low)))
-            tried = np.clip(np.concatenate([others, around.reshape(-1, len(low))]), low, high)
-            checks = self.at(tried)
-            rates = rates_in(checks, answer.metric, self.h)
-            if rates.min() > 0.3 * answer.rate or turn == _ROUNDS - 1:
+            found = common_metric(self.jacobians, h=self.h, slack=self.slack, progress=progress)
+            if found.metric is None:
+                assert found.violated is not None
+                away = np.abs(self.jacobians - found.violated).max(axis=(1, 2))
+                return found, self.points, away, 0.0
+            worst = np.argsort(rates_in(self.jacobians, found.metric, self.h))[:_WORST]
+            points, rates, margin = lowest(
+                partial(self.rates, found.metric),
+                self.points[worst],
+                lambda s: np.clip(s, self.low, self.high),
+                0.1 * (self.high - self.low),
+            )
+            if rates.min() - margin > 0.3 * found.rate:
                 break
-            worst = np.argsort(rates)[:20]
-            self.points = np.concatenate([self.points, tried[worst]])
-            self.jacobians = np.concatenate([self.jacobians, checks[worst]])
-        return answer, rates, tried, checks
+            new = points[np.argsort(rates)[:_WORST]]
+            self.points = np.concatenate([self.points, new])
+            self.jacobians = np.concatenate([self.jacobians, self.outward(self.at(new))])
+        return found, points, rates, margin
 
     def smaller(self) -> str:
         """Whether the points in the middle of the box alone have a metric, as a clause."""
@@ -193,14 +237,6 @@ class _Looked:
             if search_metric(self.jacobians[inside], discrete=self.h is not None)[0] is not None:
                 return f"; at its {inside.sum()} points within 1/{part} of the box one metric fits"
         return ""
-
-
-def _integrates(loop: Loop, low: Array, high: Array) -> bool:
-    """Whether the command depends on int z at all."""
-    s = np.random.default_rng(1).uniform(low, high, (64, len(low)))
-    other = s.copy()
-    other[:, loop.n :] *= -0.37
-    return bool((loop.field(0.0, s) != loop.field(0.0, other)).any())
 
 
 def _text(vector: Array) -> str:

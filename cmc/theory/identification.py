@@ -32,7 +32,8 @@ def differences(function: Callable[[Array], Array], x: ArrayLike, step: ArrayLik
     if step.shape not in ((), x.shape[-1:]):
         raise ValueError(f"step needs a number or shape {x.shape[-1:]}, got shape {step.shape}")
     shift = np.diag(np.broadcast_to(step, x.shape[-1:]))
-    up, down = function(x[..., None, :] + shift), function(x[..., None, :] - shift)
+    # both ends in one call: a solver inside then takes the same steps for both
+    up, down = function(np.stack([x[..., None, :] + shift, x[..., None, :] - shift]))
     return np.swapaxes((up - down) / (2 * np.diagonal(shift)[:, None]), -1, -2)
 
 
@@ -135,15 +136,9 @@ def fit_latent(y: ArrayLike, u: ArrayLike, y_next: ArrayLike, dt: float) -> Late
     looks like one at 2 pi / dt - w (aliasing), and no data at this `dt` can tell them apart. Below
     four samples a turn, dt > pi / (2 w), a warning says so.
 
-    Args:
-        y: latent signals (N, n).
-        u: commands (N, m).
-        y_next: latent signals one sample later (N, n).
-        dt: sample time, s.
-
-    Raises:
-        PoorDataError: if the data do not tell all coefficients apart, or if no continuous-time
-            model has the fitted map (an eigenvalue of Phi on the negative real axis).
+    Signals y (N, n), commands u (N, m), the signals one sample later y_next (N, n), dt in s. A
+    PoorDataError says that the data do not tell all coefficients apart, or that no continuous-time
+    model has the fitted map (an eigenvalue of Phi on the negative real axis).
     """
     y = checked("y", y, "N n")
     u = checked("u", u, "N m", N=len(y))

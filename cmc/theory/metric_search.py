@@ -56,14 +56,7 @@ def condition_metric(vertices: ArrayLike, metric: ArrayLike, *, discrete: bool =
 
     Minimises kappa subject to the inequalities and I <= M <= kappa I, from a metric that meets
     them, to within 2 %. A smaller condition number is a smaller bound on the transient.
-
-    Args:
-        vertices: Matrices, (V, m, m), as in `search_metric`.
-        metric: A common metric of the vertices, (m, m).
-        discrete: Whether the vertices are steps of a sampled loop.
-
-    Raises:
-        ValueError: if the given metric is not a common metric of the vertices.
+    Arguments as of `search_metric`.
     """
     J = checked("vertices", vertices, "V m m")
     metric_factor(metric)
@@ -155,9 +148,7 @@ class _Barrier:
         self.KT = _transposed(self.K)
         image = _transposed(D)[:, None] @ basis @ self.K[:, None]
         size = np.sqrt(np.square(image + _transposed(image)).sum(axis=(1, 2, 3)))
-        self.D = (
-            D / size[:, None, None]
-        )  # every inequality may be scaled by its own positive factor
+        self.D = D / size[:, None, None]  # every inequality may be scaled by a positive factor
         self.DT = _transposed(self.D)
 
     def pack(self, P: Array) -> Array:
@@ -210,9 +201,8 @@ class _Barrier:
         m, d = self.m, len(x) - 1
         curved = (P.reshape(-1, m * m).T @ R.reshape(-1, m * m)).reshape(m, m, m, m)
         hessian = np.empty((d + 1, d + 1))
-        hessian[:d, :d] = (
-            self.basis @ curved.transpose(3, 0, 1, 2).reshape(m * m, -1) @ self.basis.T
-        )
+        curved = curved.transpose(3, 0, 1, 2).reshape(m * m, -1)
+        hessian[:d, :d] = self.basis @ curved @ self.basis.T
         hessian[:d, d] = hessian[d, :d] = self.basis @ mixed.ravel()
         hessian[d, d] = second
         return np.append(self.basis @ slope.ravel(), weight - first), hessian

@@ -134,14 +134,8 @@ def reach(
     condition is affine in J: corners of the slopes are enough. (Boyd et al. 1994, section 6.1.3;
     Abedor, Nagpal, Poolla 1996.)
 
-    Args:
-        jacobians: corners of the loop's Jacobian, (V, n, n) or (n, n).
-        metric: M, (n, n).
-        channel: B, (n, m).
-        samples: values of a that are tried.
-
-    Returns:
-        1 / sqrt(s); infinite where the metric proves nothing.
+    Corners of the Jacobian (V, n, n) or (n, n), M (n, n), B (n, m); `samples` is how many values of
+    a are tried. Returns 1 / sqrt(s), infinite where the metric proves nothing.
     """
     M = checked("metric", metric, "n n")
     J = checked("jacobians", jacobians, "... n n", n=len(M)).reshape(-1, len(M), len(M))

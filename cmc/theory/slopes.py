@@ -46,8 +46,9 @@ def action_of(policy: Any, n: int) -> Action:
 
 
 def inner(policy: Any) -> Any:
-    """The policy that acts on s: what `cmc.sb3` keeps inside, the thing itself otherwise."""
-    return policy.on_signals() if hasattr(policy, "on_signals") else policy
+    """The policy that acts on s, on the CPU: what `cmc.sb3` keeps inside, or the thing itself."""
+    policy = policy.on_signals() if hasattr(policy, "on_signals") else policy
+    return copy.deepcopy(policy).cpu() if hasattr(policy, "cpu") else policy
 
 
 def factor_of(policy: Any, gains: Array) -> Array:
@@ -239,11 +240,8 @@ def compose_hierarchical(
     Block i is driven by blocks j > i only. Scaling block i by eps^(n-1-i) shrinks every coupling by
     a power of eps, so some eps > 0 keeps the rate as near to the slowest block's as wanted.
 
-    Args:
-        metrics: One metric per block, (m_i, m_i).
-        rates: One rate per block, 1/s, positive.
-        couplings: For i < j the vertices (V, m_i, m_j) of the block through which j drives i.
-        h: Sample time, s, where the blocks are steps.
+    One metric (m_i, m_i) and one rate (1/s) a block; couplings[i, j], i < j, are the vertices
+    (V, m_i, m_j) through which j drives i; h (s) where the blocks are steps.
     """
     if not (np.isfinite(rates).all() and min(rates) > 0):
         raise ValueError(f"every block needs a positive rate, got {list(rates)}")

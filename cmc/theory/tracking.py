@@ -29,13 +29,11 @@ class Tracker:
     that turn by more than about 45 degrees cannot be followed.
     """
 
-    def __init__(self) -> None:
-        """Start without a past."""
-        self.reset()
+    _before: AuxiliarySpace | None = None
 
     def reset(self) -> None:
         """Forget the past: the next step fixes order and sign anew."""
-        self._before: AuxiliarySpace | None = None
+        self._before = None
 
     def update(self, f_y: ArrayLike, f_u: ArrayLike) -> AuxiliarySpace:
         """Return the auxiliary space of this step; f_y [1/s] and f_u are (n, n)."""
@@ -68,10 +66,7 @@ def track(f_y_path: ArrayLike, f_u_path: ArrayLike) -> AuxiliarySpace:
     """Decompose a whole path with order, sign and scale continuous in time, (time, n, n).
 
     The same answer as a `Tracker` fed step by step, but vectorised over time.
-
-    Args:
-        f_y_path: Jacobians in `y` [1/s], (time, n, n).
-        f_u_path: Jacobians in `u`, (time, n, n), or (n, n) where constant.
+    The Jacobian in `u` may be (n, n), constant; those in `y` are in 1/s.
     """
     f_y, f_u = checked("f_y_path", f_y_path, "time n n"), checked("f_u_path", f_u_path)
     shape = "n n" if f_u.ndim == 2 else "time n n"
