@@ -16,11 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmc.envs.panda_task import PandaTask
 from cmc.envs.vector import Array, Array32, Mask, NativeVectorEnv, Seed, SingleEnv, Step
-from cmc.theory.arrays import checked
+from cmc.theory.arrays import checked, refuse_uncallable
 
 ActionMode = Literal["two_level", "low", "high"]
-LowLevel = Callable[[Array, Array], ArrayLike]
-"""Low-level policy: y (N, 6) and its integral (N, 6) to actions (N, 6) in [-1, 1]."""
 
 
 class PandaVectorEnv(NativeVectorEnv):
@@ -31,8 +29,9 @@ class PandaVectorEnv(NativeVectorEnv):
     - "two_level": (u, sub-goal), concatenated. The sub-goal is read at the first tick and then at
       every `horizon`-th one; in between it is ignored.
     - "low": u alone; sub-goals come from `task.set_subgoal`, and the start pose is the first.
-    - "high": the sub-goal alone; a step lasts `horizon` ticks, with `low_level` (default: u = 0)
-      acting at every tick. Rewards are summed, contact forces and penetrations maximised.
+    - "high": the sub-goal alone; a step lasts `horizon` ticks, with `low_level` (y and its
+      integral, (N, 6) each, to actions (N, 6) in [-1, 1]; default: 0) acting at every tick. Rewards
+      are summed, contact forces and penetrations maximised.
 
     The space of observations is unbounded: nothing in them is clipped.
     """
@@ -41,22 +40,22 @@ class PandaVectorEnv(NativeVectorEnv):
         self,
         task: PandaTask,
         action_mode: ActionMode = "two_level",
-        low_level: LowLevel | None = None,
+        low_level: Callable[[Array, Array], ArrayLike] | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
     ) -> None:
         modes = get_args(ActionMode)
         if action_mode not in modes:
             raise ValueError(f"action_mode must be one of {modes}, got {action_mode!r}")
-        if low_level is not None and (action_mode != "high" or task.config.command == "joint"):
-            raise ValueError('low_level goes with action_mode "high" and a pose command only')
+        if low_level is not None:
+            refuse_uncallable("low_level", low_level)
+            if action_mode != "high" or task.config.command == "joint":
+                raise ValueError('low_level goes with action_mode "high" and a pose command only')
         self.task, self.action_mode, self._low_level = task, action_mode, low_level
         c = task.config
         high, low = [c.subgoal_low, c.subgoal_high], np.outer([-1, 1], np.ones(c.low_size))
-        both = {"two_level": np.hstack([low, high]), "low": low, "high": np.array(high)}[
-            action_mode
-        ]
-        action: Any = spaces.Box(*both.astype(np.float32))
+        both = {"two_level": np.hstack([low, high]), "low": low, "high": np.array(high)}
+        action: Any = spaces.Box(*both[action_mode].astype(np.float32))
         seen = spaces.Box(-np.inf, np.inf, (task.observation_size,), dtype=np.float32)
         super().__init__(task.num, seen, action, autoreset_mode, render_mode)
 
@@ -69,10 +68,9 @@ class PandaVectorEnv(NativeVectorEnv):
 
     def _advance(self, actions: ArrayLike) -> Step:
         task, low = self.task, self.task.config.low_size
-        if self.action_mode != "low":
-            size = self.single_action_space.shape[0]
-            actions = values = checked("action", actions, "N size", N=task.num, size=size)
         if self.action_mode == "two_level":
+            size = self.single_action_space.shape[0]
+            values = checked("action", actions, "N size", N=task.num, size=size)
             if task.due.any():
                 task.set_subgoal(values[:, low:], task.due)
             actions = values[:, :low]
@@ -125,7 +123,7 @@ class PandaEnv(SingleEnv):
             gym.logger.warn("render was called without render_mode='rgb_array'")
             return None
         if self._renderer is None:
-            self._renderer = _renderer(self.task)
+            self._renderer = _renderer(self.task.worlds.model)
         self._renderer.update_scene(self.task.worlds.data[0])
         return np.asarray(self._renderer.render())
 
@@ -143,13 +141,13 @@ _failures: list[str] = []
 """Why there are no graphics: a second attempt to start them aborts the whole process."""
 
 
-def _renderer(task: PandaTask) -> mujoco.Renderer:
+def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
     windows = sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "MUJOCO_GL")))
     if not windows and not _failures:
         _failures.append("neither DISPLAY nor MUJOCO_GL is set")
     if not _failures:
         try:
-            return mujoco.Renderer(task.worlds.model, 480, 640)
+            return mujoco.Renderer(model, 480, 640)
         except Exception as error:  # EGL, GLFW and OSMesa raise whatever they like
             _failures.append(str(error))
     raise RuntimeError(

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from cmc.envs.panda_gym import PandaEnv, PandaVectorEnv
-from cmc.envs.panda_task import PandaTask
+from cmc.envs.panda_task import PandaTask, PandaTaskConfig
 from cmc.envs.vector import Array
-from cmc.envs.worlds import PandaTaskConfig
 from cmc.robot.osc import PUSH_GAINS, ControlLaw
 from cmc.robot.panda import Peg
 

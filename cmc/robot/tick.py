@@ -243,15 +243,12 @@ def refresh(rows: Record, laws: Record, jacs: Array) -> None:
 
 
 @compiled
-def tick(rows: Record, laws: Record, jacs: Array, actions: Array, start: int, stop: int) -> bool:
-    """One tick of the worlds from `start` to `stop`; False, and nothing done, without numbers.
+def tick(rows: Record, laws: Record, jacs: Array, actions: Array, start: int, stop: int) -> None:
+    """One tick of the worlds from `start` to `stop`.
 
-    Actions (N, 6 or 7) are in units of `u_limit`, and clipped to [-1, 1].
+    Actions (N, 6 or 7) are finite, in units of `u_limit`, and clipped to [-1, 1].
     """
     law = laws[0]
-    for value in actions.flat:
-        if not np.isfinite(value):
-            return False
     tau, u = np.zeros(law.nv), np.zeros(JOINTS)
     for k in range(start, stop):
         w, jac = rows[k], jacs[k]
@@ -276,7 +273,6 @@ def tick(rows: Record, laws: Record, jacs: Array, actions: Array, start: int, st
         w.ticks += 1.0
         _look(w, law, jac)
         w.integral[:3] += law.tick * w.latent[:3]  # I_k = I_{k-1} + h y_k
-    return True
 
 
 @compiled
@@ -289,9 +285,3 @@ def _contact(w: Any, steps: int) -> None:
         largest = max(largest, forces[i, 0] ** 2 + forces[i, 1] ** 2 + forces[i, 2] ** 2)
         nearest = min(nearest, distances[i])
     w.peaks[0], w.peaks[1] = np.sqrt(largest), -nearest
-
-
-@compiled
-def torque(rows: Record, laws: Record, jacs: Array, reference: Array, tau: Array) -> None:
-    """Torque of the law for one world that was last looked at in its present state."""
-    _torque(rows[0], laws[0], jacs[0], reference, tau)

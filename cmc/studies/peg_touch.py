@@ -31,7 +31,7 @@ from dataclasses import replace
 
 from torch import nn
 
-from cmc.envs.peg_touch_config import PegTouchConfig
+from cmc.envs.peg_touch import PegTouchConfig
 from cmc.policies import IndependentNetwork, JointNetwork
 from cmc.studies.peg_touch_arms import (
     Network,

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cmc.envs.panda_task import HIGH_LEVEL, PandaTask
-from cmc.envs.worlds import PandaTaskConfig
+from cmc.envs.panda_task import HIGH_LEVEL, PandaTask, PandaTaskConfig
 from cmc.learning.hierarchy import HierarchyConfig
 from cmc.learning.latent import LatentConfig, LatentModel
 from cmc.learning.planning import Planning
