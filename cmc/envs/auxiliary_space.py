@@ -100,7 +100,7 @@ class AuxiliarySpaceWrapper(gym.Wrapper[Array32, Any, Any, Any]):
         seen = checked("observation", obs)
         e = checked("error", self.error(seen), "n", n=self.n)
         if self.model is not None:
-            f_y, f_u = self.model(seen)
+            f_y, f_u = checked("model: f_y and f_u", self.model(seen), "2 n n", n=self.n)
             self.space = self._tracker.update(f_y, f_u)
         else:
             found = self.transforms(seen) if callable(self.transforms) else self.transforms
@@ -150,8 +150,8 @@ class AuxiliarySpaceVectorWrapper(NativeVectorEnv):
 
     def _advance(self, actions: ArrayLike) -> Step:
         a = checked("actions", actions, "N n", N=self.num_envs, n=len(self.u0))
-        obs, *rest = self.plants._advance(self.u0 + a @ self.space.T_a.T)
-        return self._seen(obs, np.ones(self.num_envs, dtype=bool)), *rest
+        step = self.plants._advance(self.u0 + a @ self.space.T_a.T)
+        return self._seen(step[0], np.ones(self.num_envs, dtype=bool)), *step[1:]
 
     def _seen(self, obs: Array32, add: Mask) -> Array32:
         """What is seen of y; the integral starts with the first error and includes the new."""

@@ -53,7 +53,8 @@ class PandaTaskConfig:
     hold: bool = True  # torque held over a tick (50 Hz), or computed at every physics step
 
     def __post_init__(self) -> None:
-        for name, kind in (("peg", Peg), ("gains", Gains), ("law", ControlLaw)):
+        kinds = {"peg": Peg, "gains": Gains, "law": ControlLaw, "increments": bool, "hold": bool}
+        for name, kind in kinds.items():
             if not isinstance(getattr(self, name), kind):
                 raise ValueError(f"{name}: wanted a {kind.__name__}, got {getattr(self, name)!r}")
         if self.command not in ("pose", "joint"):
@@ -109,6 +110,8 @@ class PandaTask:
     def __init__(
         self, config: PandaTaskConfig, num: int = 1, seed: int | None = None, threads: int = 1
     ) -> None:
+        if not isinstance(config, PandaTaskConfig):
+            raise TypeError(f"config: wanted a PandaTaskConfig, got {config!r}")
         self.config, self.num, self.threads = config, num, threads
         c, joint, steps = config, config.command == "joint", round(config.tick / config.timestep)
         self._q_start = inverse_kinematics(c.start, tool=FINGERTIP + c.peg.length)
@@ -282,6 +285,8 @@ class PandaTask:
 
     def restore(self, snapshot: Mapping[str, Any]) -> Array:
         """Go back to a snapshot of the same task and number of worlds; observations (N, size)."""
+        if not isinstance(snapshot, Mapping) or "physics" not in snapshot:
+            raise TypeError(f"snapshot: wanted what `snapshot` gave, got {snapshot!r}")
         found, wanted = np.shape(snapshot["physics"]), self.worlds.get_state().shape
         if found != wanted:
             raise ValueError(f"the snapshot is of other worlds: physics {found}, wanted {wanted}")

@@ -162,6 +162,8 @@ class PegTouchVectorEnv(NativeVectorEnv):
         render_mode: str | None = None,
         **overrides: Any,
     ) -> None:
+        if not isinstance(config, PegTouchConfig | None):
+            raise TypeError(f"config: wanted a PegTouchConfig, got {config!r}")
         self.config = c = replace(config or PegTouchConfig(), **overrides)
         action = spaces.Box(-c.action_limit, c.action_limit, (2,), np.float32)
         observation = spaces.Box(*c.observation_bounds(), dtype=np.float32)
@@ -238,7 +240,8 @@ class PegTouchVectorEnv(NativeVectorEnv):
             least = 0.0 if name == "K_sur" else None
             drawn[name] = checked(label, found, "N", N=self.num_envs, above=least)
         for name, value in drawn.items():
-            self.sampled[name] = np.where(mask, value, self.sampled.get(name, value))
+            new: Array = np.where(mask, value, self.sampled.get(name, value))
+            self.sampled[name] = new
         start = np.stack([self.sampled["x0"], self.sampled["z0"]], axis=-1)
         self.position = np.where(mask[:, None], start, self.position)
         self.command = np.where(mask[:, None], c.u0, self.command)

@@ -103,6 +103,9 @@ class ControlLaw:
     def __post_init__(self) -> None:
         if self.form not in ("acceleration", "force"):
             raise ValueError(f"form must be 'acceleration' or 'force', got {self.form!r}")
+        for name in ("split", "drift"):
+            if not isinstance(getattr(self, name), bool):
+                raise TypeError(f"{name}: wanted True or False, got {getattr(self, name)!r}")
         if self.split and self.form != "force":
             raise ValueError("split blocks exist for the force form only")
         if self.error_limit is not None:

@@ -70,9 +70,11 @@ def load_scene(
         ValueError: if the file is missing, does not parse, or holds no peg, and if the physics step
             `timestep` is not in (0, 5 ms]: contact needs two steps in 10 ms.
     """
-    spec = scene_spec(scene, peg, timestep)
+    spec, steps = scene_spec(scene, peg, timestep), number("history", history, least=0.0)
+    if steps % 1:
+        raise ValueError(f"history: wanted a whole number of steps, got {history}")
     for sensor in spec.sensors:
-        sensor.nsample = int(number("history", history, least=0.0))
+        sensor.nsample = int(steps)
     try:
         return spec.compile()
     except ValueError as error:
