@@ -121,7 +121,7 @@ def test_reward_and_target_are_ones_own():
 
 
 def test_bad_plants_and_arguments_are_refused():
-    with pytest.raises(ValueError, match="h > 0 and room"):
+    with pytest.raises(ValueError, match="h needs positive"):
         PlantEnv(h=0.0)
     with pytest.raises(ValueError, match="horizon needs a whole number"):
         PlantEnv(horizon=2.5)
