@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
-import gymnasium as gym
-import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cmc.envs.panda_task import PandaTask
 from cmc.envs.vector import Array, Array32, Mask, NativeVectorEnv, Seed, SingleEnv, Step
@@ -98,60 +94,33 @@ class PandaVectorEnv(NativeVectorEnv):
 
 
 class PandaEnv(SingleEnv):
-    """One world of a peg task; the tasks' own classes document spaces and rewards."""
+    """One world of a peg task; the tasks' own classes document spaces and rewards.
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
-    _renderer: mujoco.Renderer | None = None
+    A Panda under task-space control carries a peg. Every tick (20 ms) a low-level action u adds an
+    acceleration to the control law, x'' = K_p e + K_d e' + u with e = sub-goal - tip; every 20
+    ticks a high-level action sets the sub-goal. Actions are clipped to their bounds; NaN, infinity
+    and wrong shapes raise ValueError.
 
-    def __init__(self, *arguments: Any, render_mode: str | None = None, **options: Any) -> None:
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode: wanted None or 'rgb_array', got {render_mode!r}")
-        super().__init__(*arguments, **options)
-        self.task: PandaTask = self.batch.task
-        self.render_mode = render_mode
+    - Observation, slices in `env.task.layout`: position of the (true) tip, m; rotation, a rotation
+      vector from pointing straight down, rad; velocity, m/s and rad/s; goal, m; error e of the
+      hand's nominal tip, m and rad; latent y = K1 e + K2 e', m/s^2 and rad/s^2; integral of y since
+      the sub-goal was set (0 for rotation); time_to_go until the next sub-goal is due, s, < 0 when
+      overdue.
+    - Reward: the sum of `info["reward_terms"]`. The low level's own, `info["tracking_terms"]`:
+      translation = -|sub-goal - tip|, m, and rotation, rad.
+    - Info: `contact_force` at the end of the tick, `contact_force_max` over its physics steps, N;
+      `penetration`, the deepest of the tick, m; `success`.
+    - End: never terminated; truncated when the time is up.
+
+    Keywords: `changes` of fields of `PandaTaskConfig`, such as `{"hold": False}` for control at
+    every physics step, and `action_mode` and `low_level` (see `PandaVectorEnv`).
+    """
+
+    @property
+    def task(self) -> PandaTask:
+        """The world, its layout of observations and its configuration."""
+        task: PandaTask = self.batch.task
+        return task
 
     def _stream(self, seed: int | None) -> int | None:
         return seed  # the same as the worlds' own
-
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
-        """The world from the scene's own point of view, (480, 640, 3); None without render mode.
-
-        Raises:
-            RuntimeError: where MuJoCo finds no graphics.
-        """
-        if self.render_mode is None:
-            gym.logger.warn("render was called without render_mode='rgb_array'")
-            return None
-        if self._renderer is None:
-            self._renderer = _renderer(self.task.worlds.model)
-        self._renderer.update_scene(self.task.worlds.data[0])
-        return np.asarray(self._renderer.render())
-
-    def close(self) -> None:
-        """Give the graphics back."""
-        if self._renderer is not None:
-            self._renderer.close()
-        self._renderer = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_renderer": None}  # graphics belong to a process
-
-
-_failures: list[str] = []
-"""Why there are no graphics: a second attempt to start them aborts the whole process."""
-
-
-def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
-    windows = sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "MUJOCO_GL")))
-    if not windows and not _failures:
-        _failures.append("neither DISPLAY nor MUJOCO_GL is set")
-    if not _failures:
-        try:
-            return mujoco.Renderer(model, 480, 640)
-        except Exception as error:  # EGL, GLFW and OSMesa raise whatever they like
-            _failures.append(str(error))
-    raise RuntimeError(
-        f"render_mode 'rgb_array' needs graphics, and there are none: {_failures[0]}. Set "
-        "MUJOCO_GL=egl (or osmesa) before Python starts, or let cmc.view.playback.record make a "
-        "3D page of the motion"
-    )

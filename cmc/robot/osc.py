@@ -22,9 +22,7 @@ itself is compiled, in `cmc.robot.tick`; `Worlds` is its face: physics seen thro
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal
 
 import mujoco
@@ -142,7 +140,6 @@ class Worlds:
         gains: Gains,
         law: ControlLaw,
         num: int = 1,
-        threads: int = 1,
         substeps: int = 1,
         **more: Any,
     ) -> None:
@@ -161,9 +158,6 @@ class Worlds:
         for name in Worlds.__annotations__:
             setattr(self, name, self.rows[name])
         self._qpos, self._qvel = ([getattr(d, n) for d in self.data] for n in ("qpos", "qvel"))
-        threads = min(count("threads", threads), num)
-        self._ends = [k * num // threads for k in range(threads + 1)]
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self.quat[:] = DOWN
         self.reset(np.zeros((num, model.nq)), np.ones(num, dtype=bool))
 
@@ -194,11 +188,7 @@ class Worlds:
         """One tick; actions (N, 6), or (N, 7) of joint control, in units of `u_limit`."""
         size = JOINTS if self._law["joint"][0] else 6
         finite = checked("low-level action", actions, "N size", N=self.num, size=size)
-        parts = self.rows, self._law, self._jacobians, np.array(finite, order="C")
-        if self._pool is None:
-            tick(*parts, 0, self.num)
-        else:
-            list(self._pool.map(partial(tick, *parts), self._ends[:-1], self._ends[1:]))
+        tick(self.rows, self._law, self._jacobians, np.array(finite, order="C"))
 
     def push(self, force: ArrayLike) -> None:
         """Let an external force (N, 3), N, act on the nominal tip, in world axes.

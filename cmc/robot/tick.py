@@ -243,14 +243,11 @@ def refresh(rows: Record, laws: Record, jacs: Array) -> None:
 
 
 @compiled
-def tick(rows: Record, laws: Record, jacs: Array, actions: Array, start: int, stop: int) -> None:
-    """One tick of the worlds from `start` to `stop`.
-
-    Actions (N, 6 or 7) are finite, in units of `u_limit`, and clipped to [-1, 1].
-    """
+def tick(rows: Record, laws: Record, jacs: Array, actions: Array) -> None:
+    """One tick; actions (N, 6 or 7) are finite, in units of `u_limit`, clipped to [-1, 1]."""
     law = laws[0]
     tau, u = np.zeros(law.nv), np.zeros(JOINTS)
-    for k in range(start, stop):
+    for k in range(len(rows)):
         w, jac = rows[k], jacs[k]
         for i in range(actions.shape[1]):
             u[i] = law.u_limit[i] * min(max(actions[k, i], -1.0), 1.0)
