@@ -118,16 +118,3 @@ def test_reward_and_target_are_ones_own():
     obs, reward, *_ = env.step(np.array([1.0, 0.0]))
     assert reward == pytest.approx(1.0 - obs[1], abs=1e-6)
     np.testing.assert_array_equal(env.batch.target, [0.5, 0.0])
-
-
-def test_bad_plants_and_arguments_are_refused():
-    with pytest.raises(ValueError, match="h needs positive"):
-        PlantEnv(h=0.0)
-    with pytest.raises(ValueError, match="horizon needs a whole number"):
-        PlantEnv(horizon=2.5)
-    with pytest.raises(ValueError, match=r"target needs shape \(2,\)"):
-        PlantEnv(target=[1.0])
-    env = PlantVectorEnv(2)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="actions needs finite"):
-        env.step(np.full((2, 2), np.nan))

@@ -240,8 +240,8 @@ class PegTouchVectorEnv(NativeVectorEnv):
             least = 0.0 if name == "K_sur" else None
             drawn[name] = checked(label, found, "N", N=self.num_envs, above=least)
         for name, value in drawn.items():
-            new: Array = np.where(mask, value, self.sampled.get(name, value))
-            self.sampled[name] = new
+            kept = self.sampled.get(name, value)
+            self.sampled[name] = np.asarray(np.where(mask, value, kept), dtype=float)
         start = np.stack([self.sampled["x0"], self.sampled["z0"]], axis=-1)
         self.position = np.where(mask[:, None], start, self.position)
         self.command = np.where(mask[:, None], c.u0, self.command)
