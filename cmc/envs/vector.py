@@ -140,7 +140,8 @@ class SingleEnv(gym.Env[Array32, Array32]):
 
     def step(self, action: ArrayLike) -> tuple[Array32, float, bool, bool, dict[str, Any]]:
         """One step; see the vector environment for the action."""
-        obs, reward, ended, truncated, info = self.batch.step([action])
+        actions = action[None] if isinstance(action, np.ndarray) else [action]
+        obs, reward, ended, truncated, info = self.batch.step(actions)
         return obs[0], reward.item(), ended.item(), truncated.item(), _each(info, _first)
 
 

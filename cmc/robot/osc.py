@@ -150,7 +150,7 @@ class Worlds:
         ):
             raise ValueError(f"model: wanted sensors with a history of {substeps} (`load_scene`)")
         self._law = _describe(model, gains, law, substeps=substeps, **more)
-        self._hand = model.body("hand").id
+        self._hand, self._actions = model.body("hand").id, (num, JOINTS if more.get("joint") else 6)
         self.data = [mujoco.MjData(model) for _ in range(num)]
         self.rows, self._jacobians = np.zeros(num, ROW), np.zeros((num, 6, model.nv))
         for row, data in zip(self.rows, self.data, strict=True):
@@ -186,9 +186,13 @@ class Worlds:
 
     def tick(self, actions: ArrayLike) -> None:
         """One tick; actions (N, 6), or (N, 7) of joint control, in units of `u_limit`."""
-        size = JOINTS if self._law["joint"][0] else 6
-        finite = checked("low-level action", actions, "N size", N=self.num, size=size)
-        tick(self.rows, self._law, self._jacobians, np.array(finite, order="C"))
+        num, size = self._actions
+        quick = isinstance(actions, np.ndarray) and actions.dtype.kind == "f"
+        if not quick or actions.shape != self._actions:  # `checked` would be a tenth of a tick
+            actions = checked("low-level action", actions, "N size", N=num, size=size)
+        values = np.array(actions, dtype=np.float64, order="C")
+        if not tick(self.rows, self._law, self._jacobians, values):
+            checked("low-level action", values)
 
     def push(self, force: ArrayLike) -> None:
         """Let an external force (N, 3), N, act on the nominal tip, in world axes.

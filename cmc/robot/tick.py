@@ -243,9 +243,15 @@ def refresh(rows: Record, laws: Record, jacs: Array) -> None:
 
 
 @compiled
-def tick(rows: Record, laws: Record, jacs: Array, actions: Array) -> None:
-    """One tick; actions (N, 6 or 7) are finite, in units of `u_limit`, clipped to [-1, 1]."""
+def tick(rows: Record, laws: Record, jacs: Array, actions: Array) -> bool:
+    """One tick; False, and nothing done, without finite numbers.
+
+    Actions (N, 6 or 7) are in units of `u_limit`, and clipped to [-1, 1].
+    """
     law = laws[0]
+    for value in actions.flat:
+        if not np.isfinite(value):
+            return False
     tau, u = np.zeros(law.nv), np.zeros(JOINTS)
     for k in range(len(rows)):
         w, jac = rows[k], jacs[k]
@@ -270,6 +276,7 @@ def tick(rows: Record, laws: Record, jacs: Array, actions: Array) -> None:
         w.ticks += 1.0
         _look(w, law, jac)
         w.integral[:3] += law.tick * w.latent[:3]  # I_k = I_{k-1} + h y_k
+    return True
 
 
 @compiled
