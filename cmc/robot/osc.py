@@ -186,9 +186,9 @@ class Worlds:
 
     def tick(self, actions: ArrayLike) -> None:
         """One tick; actions (N, 6), or (N, 7) of joint control, in units of `u_limit`."""
-        num, size = self._actions
-        quick = isinstance(actions, np.ndarray) and actions.dtype.kind == "f"
-        if not quick or actions.shape != self._actions:  # `checked` would be a tenth of a tick
+        num, size = shape = self._actions
+        floats = isinstance(actions, np.ndarray) and actions.dtype.kind == "f"
+        if not floats or np.shape(actions) != shape:  # always `checked`: a tenth of a tick more
             actions = checked("low-level action", actions, "N size", N=num, size=size)
         values = np.array(actions, dtype=np.float64, order="C")
         if not tick(self.rows, self._law, self._jacobians, values):
