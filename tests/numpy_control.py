@@ -1,8 +1,9 @@
-"""The control law and the tick once more, in numpy: what tests compare the compiled ones with."""
+"""The control law and the tick once more, in numpy; and the compiled ones, asked in any state."""
 
 import mujoco
 import numpy as np
 
+from cmc.robot.osc import ControlLaw, Worlds
 from cmc.robot.panda import DOWN, JOINTS
 
 
@@ -31,9 +32,7 @@ def solve(matrix, right, floor):
 
 def pose_error(model, data, law, position, quat, site="tip_nominal"):
     """Error (6,), velocity (6,) and Jacobian (6, nv) of the driven joints."""
-    index = model.site(site).id
-    jac = np.zeros((6, model.nv))
-    mujoco.mj_jacSite(model, data, jac[:3], jac[3:], index)
+    index, jac = model.site(site).id, jacobian(model, data, site)
     jac[:, JOINTS:] = 0.0
     turn = np.empty(4)
     mujoco.mju_mat2Quat(turn, data.site_xmat[index])
@@ -84,3 +83,39 @@ def tick(model, data, config, law, position, u, quat=DOWN):
         largest, deepest = max(largest, np.linalg.norm(force)), max(deepest, -distance[0])
         mujoco.mj_step1(model, data)
     return largest, deepest
+
+
+class Compiled:
+    """The compiled law of one arm, from a scene with a history: errors and torques of states."""
+
+    def __init__(self, model, gains, law=None, unit=1e3):
+        self.gains, self.unit = gains, unit
+        self.worlds = Worlds(model, gains, law or ControlLaw(), u_limit=np.full(JOINTS, unit))
+
+    def look(self, data, position, quat=DOWN):
+        """Pose error (6,) and velocity (6,) of the tip."""
+        worlds = self.worlds
+        worlds.data[0].qpos[:], worlds.data[0].qvel[:] = data.qpos, data.qvel
+        worlds.target[:], worlds.quat[:] = position, quat
+        mujoco.mj_step1(worlds.model, worlds.data[0])
+        worlds.refresh()
+        return worlds.signals[0, :6].copy(), worlds.signals[0, 6:].copy()
+
+    def torque(self, data, position, quat, u):
+        """Joint torques (7,) before the motors' limits."""
+        self.look(data, position, quat)
+        self.worlds.tick(np.array(u)[None] / self.unit)
+        return self.worlds.data[0].ctrl.copy()
+
+    def torque_for(self, data, reference):
+        """Joint torques (7,) for the tip acceleration `reference` (6,)."""
+        error, velocity = self.look(data, np.zeros(3))
+        u = reference - self.gains.kp * error + self.gains.kd * velocity
+        return self.torque(data, np.zeros(3), DOWN, u)
+
+
+def jacobian(model, data, site="tip_nominal"):
+    """Jacobian (6, nv) of a site."""
+    jac = np.zeros((6, model.nv))
+    mujoco.mj_jacSite(model, data, jac[:3], jac[3:], model.site(site).id)
+    return jac

@@ -49,7 +49,7 @@ def test_the_checkers_pass(name, mode):
     env = make(name, action_mode=mode)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*(symmetric and normalized|infinity).*")
-        check_env(env, skip_render_check=True)  # drawing needs graphics: a test of its own
+        check_env(env)
         check_env_sb3(env)
 
 
@@ -104,22 +104,10 @@ def test_seeds_decide_and_time_is_truncation(name):
     assert ends == [(False, False)] * (steps - 1) + [(False, True)]
 
 
-def test_a_picture_or_a_sentence_that_names_the_page():
-    env = gym.make("cmc/PegMaze-v0", render_mode="rgb_array")
-    env.reset(seed=0)
-    try:
-        picture = env.render()
-    except RuntimeError:  # no graphics here
-        with pytest.raises(RuntimeError, match="cmc.view.playback.record"):
-            env.render()
-    else:
-        assert picture.shape == (480, 640, 3)
-        assert np.ptp(picture) > 50
-    env.close()
-    with pytest.raises(ValueError, match="render_mode: wanted None or 'rgb_array', got 'human'"):
-        PegMazeEnv(render_mode="human")
-    with pytest.raises(TypeError, match="record makes a 3D page"):
-        PegMazeVectorEnv(2, render_mode="rgb_array")
+@pytest.mark.parametrize("kind", [PegMazeEnv, PegMazeVectorEnv])
+def test_a_render_mode_is_refused_with_the_name_of_what_draws(kind):
+    with pytest.raises(TypeError, match="cmc.view.playback.record makes a 3D page"):
+        kind(render_mode="rgb_array")
 
 
 @pytest.mark.parametrize("name", ["stiff", "soft", "push"])
@@ -197,52 +185,6 @@ def test_tilted_sub_goals_cannot_random_walk():
             task.set_subgoal(np.array([[0, 0, 0.005, 0.5, 0, 0]]))
         task.step(np.zeros((1, 6)))
     assert 0.3 < np.linalg.norm(task.worlds.rotation) < 0.51
-
-
-@each_task
-def test_bad_actions_are_refused_and_leave_the_world_alone(name):
-    task = build(name, 2)
-    low, high = task.config.low_size, task.config.high_size
-    before = task.snapshot()["physics"]
-    for bad in (np.zeros(low), np.zeros((2, low + 1)), np.full((2, low), np.nan)):
-        with pytest.raises(ValueError, match="low-level action: wanted"):
-            task.step(bad)
-    for bad in (np.zeros((1, high)), np.full((2, high), np.inf)):
-        with pytest.raises(ValueError, match="high-level action needs"):
-            task.set_subgoal(bad)
-    with pytest.raises(ValueError, match="mask"):
-        task.reset(np.array([True]))
-    with pytest.raises(ValueError, match="seed"):
-        task.seed([1])
-    np.testing.assert_array_equal(task.snapshot()["physics"], before)
-    env = make(name)
-    env.reset(seed=0)
-    with pytest.raises(ValueError, match="action needs finite"):
-        env.step(np.full(env.action_space.shape, np.nan, dtype=np.float32))
-
-
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        ({"action_mode": "fast"}, "action_mode"),
-        ({"low_level": lambda y, i: y}, "low_level"),
-        ({"changes": {"timestep": 0.003}}, "multiple"),
-        ({"changes": {"u_limit": (1.0,)}}, "u_limit"),
-        ({"changes": {"ticks": 2.5}}, "ticks"),
-        ({"changes": {"command": "torque"}}, "command"),
-        ({"changes": {"gains": None}}, "gains: wanted a Gains"),
-        ({"changes": {"subgoal_low": (1.0,) * 6}}, "subgoal_low must lie below"),
-        ({"changes": {"scene": "nowhere.xml"}}, "neither"),
-        ({"changes": {"start": (2.0, 0.0, 0.0)}}, "no joint angles"),
-    ],
-)
-def test_bad_arguments_are_refused(more, message):
-    with pytest.raises(ValueError, match=message):
-        make("push", **more)
-    with pytest.raises(ValueError, match="regime"):
-        PegMazeEnv("hard")
-    with pytest.raises(ValueError, match="worlds"):
-        PegPush(PUSH, 0)
 
 
 @each_task

@@ -4,12 +4,14 @@ import mujoco
 import numpy as np
 import pytest
 from lesson import lesson
+from numpy_control import Compiled
 
-from cmc.robot.osc import MAZE_GAINS, ControlLaw, Gains, TaskSpaceController
-from cmc.robot.panda import DOWN
+from cmc.robot.osc import MAZE_GAINS, ControlLaw, Gains
+from cmc.robot.panda import load_scene
 
 HERE = lesson("10")
 FREE = HERE["FREE"]
+SCENE = load_scene(history=1)
 
 
 def states(number=5):
@@ -31,21 +33,19 @@ def states(number=5):
     ],
 )
 def test_the_cells_torques_are_the_librarys(cell, law):
-    for model, data, s, p in states():
-        controller = TaskSpaceController(model, MAZE_GAINS, ControlLaw(**law, pivot_floor=1e-12))
-        controller.observe(data)
+    for _, data, s, p in states():
+        controller = Compiled(SCENE, MAZE_GAINS, ControlLaw(**law, pivot_floor=1e-12))
         qn = HERE["READY"] - s.q - 2.0 * s.qd
-        np.testing.assert_allclose(HERE[cell](s, p, qn), controller.torque_for(p), atol=1e-6)
+        np.testing.assert_allclose(HERE[cell](s, p, qn), controller.torque_for(data, p), atol=1e-6)
 
 
 def test_the_cells_error_is_the_librarys_to_first_order():
     model, data, s, _ = next(states(1))
     data.qpos[:7] = HERE["world"](FREE)[1].qpos[:7] + 1e-4
     s = HERE["sense"](model, data)
-    controller = TaskSpaceController(model, MAZE_GAINS)
-    controller.observe(data)
     goal = np.array(FREE) + 0.01
-    np.testing.assert_allclose(HERE["pose_error"](s, goal), controller.error(goal, DOWN), atol=1e-9)
+    error, _ = Compiled(SCENE, MAZE_GAINS).look(data, goal)
+    np.testing.assert_allclose(HERE["pose_error"](s, goal), error, atol=1e-9)
 
 
 def test_the_cells_kinematics_are_the_scenes():

@@ -1,8 +1,4 @@
-"""Any Gymnasium environment with a known model, seen and commanded in its auxiliary space.
-
-`AuxiliarySpaceWrapper` is for one trajectory and any environment, `AuxiliarySpaceVectorWrapper` for
-the native batches of `PlantVectorEnv` and transforms that are kept.
-"""
+"""Any Gymnasium environment with a known model, seen and commanded in its auxiliary space."""
 
 from __future__ import annotations
 
@@ -12,16 +8,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike
 
 from cmc.envs.plant_env import PlantVectorEnv
-from cmc.envs.vector import Array, Array32, Mask, Step
-from cmc.theory.arrays import checked, number
+from cmc.envs.vector import Array, Array32, Mask, NativeVectorEnv, Seed, Step
+from cmc.theory.arrays import checked, number, refuse_uncallable
 from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.tracking import Tracker
 
-Error = Callable[[Array], Array]
 Model = Callable[[Array], tuple[Array, Array]]
 Transforms = AuxiliarySpace | Callable[[Array], AuxiliarySpace]
 
@@ -42,7 +36,6 @@ class AuxiliarySpaceWrapper(gym.Wrapper[Array32, Any, Any, Any]):
         transforms: in place of `model`: an `AuxiliarySpace`, or a function of the observation to
             one, such as `feedback` or `schur` of `cmc.theory.combinations` give.
         h: time between two steps [s].
-        integral: whether the integral is observed; without it the observation is z (n,).
         u0: command to which T_a a is added, broadcast to (n,).
         limit: bound of the declared action space; the command is clipped to the env's own.
 
@@ -56,28 +49,29 @@ class AuxiliarySpaceWrapper(gym.Wrapper[Array32, Any, Any, Any]):
         self,
         env: gym.Env[Any, Any],
         *,
-        error: Error,
+        error: Callable[[Array], Array],
         h: float,
         model: Model | None = None,
         transforms: Transforms | None = None,
-        integral: bool = True,
         u0: ArrayLike = 0.0,
         limit: float = 1.0,
     ) -> None:
         super().__init__(env)
         if not isinstance(env.action_space, spaces.Box):
-            raise TypeError(f"wanted a Box of commands, got {env.action_space}")
+            raise TypeError(f"env: wanted a Box of commands, got {env.action_space}")
         if len(env.action_space.shape) != 1:
-            raise ValueError(f"wanted flat commands, got {env.action_space}")
+            raise ValueError(f"env: wanted flat commands, got {env.action_space}")
         if (model is None) == (transforms is None):
             raise TypeError("wanted either a model or transforms")
+        refuse_uncallable("error", error)
+        if model is not None:
+            refuse_uncallable("model", model)
         self.n, self.h = env.action_space.shape[0], number("h", h, above=0.0)
         self.error, self.model, self.transforms = error, model, transforms
-        self._inner, self._columns = env.action_space, slice(None, None, 1 if integral else 2)
-        self.u0 = np.broadcast_to(np.asarray(u0, dtype=float), (self.n,)).copy()
+        self._inner = env.action_space
+        self.u0, limit = _command("u0", u0, self.n), number("limit", limit, above=0.0)
         self.action_space = spaces.Box(-limit, limit, (self.n,), np.float32)
-        size = 2 * self.n if integral else self.n
-        self.observation_space = self._seen = spaces.Box(-1e6, 1e6, (size,), np.float32)
+        self.observation_space = spaces.Box(-1e6, 1e6, (2 * self.n,), np.float32)
         self.integral, self._tracker = np.zeros(self.n), Tracker()
         self.space: AuxiliarySpace | None = None
 
@@ -100,10 +94,11 @@ class AuxiliarySpaceWrapper(gym.Wrapper[Array32, Any, Any, Any]):
         return self._observe(obs), reward, terminated, truncated, info
 
     def _observe(self, obs: Any) -> Array32:
-        seen = np.asarray(obs, dtype=float)
+        seen = checked("observation", obs)
         e = checked("error", self.error(seen), "n", n=self.n)
         if self.model is not None:
-            self.space = self._tracker.update(*self.model(seen))
+            f_y, f_u = checked("model: f_y and f_u", self.model(seen), "2 n n", n=self.n)
+            self.space = self._tracker.update(f_y, f_u)
         else:
             found = self.transforms(seen) if callable(self.transforms) else self.transforms
             if not isinstance(found, AuxiliarySpace) or found.T_y.shape != (self.n, self.n):
@@ -111,11 +106,11 @@ class AuxiliarySpaceWrapper(gym.Wrapper[Array32, Any, Any, Any]):
             self.space = found
         z = self.space.T_y @ e
         self.integral = self.integral + self.h * z  # the new value included, as everywhere
-        s = np.stack([z, self.integral], axis=-1).ravel()[self._columns]
-        return np.clip(s, self._seen.low, self._seen.high).astype(np.float32)
+        s = np.stack([z, self.integral], axis=-1).ravel()
+        return np.clip(s, -1e6, 1e6).astype(np.float32)
 
 
-class AuxiliarySpaceVectorWrapper(gym.vector.VectorWrapper[Array32, ArrayLike, Array]):
+class AuxiliarySpaceVectorWrapper(NativeVectorEnv):
     """N plants that are observed by (z_i, integral of z_i), s flat (N, 2 n), and moved by a.
 
     z = T_y (y - target) and u = u0 + T_a a, clipped to the plant's limits, as in
@@ -125,46 +120,45 @@ class AuxiliarySpaceVectorWrapper(gym.vector.VectorWrapper[Array32, ArrayLike, A
     sample time are the plants' `target` and `h`; u0, (n,), holds the target by default.
 
     Raises:
-        TypeError: if the transforms move with the state.
+        TypeError: if env is no `PlantVectorEnv`, or the transforms move with the state.
         ValueError: if the plant cannot be held at the target.
     """
 
     def __init__(
         self, env: PlantVectorEnv, transforms: AuxiliarySpace, *, u0: ArrayLike | None = None
     ) -> None:
-        super().__init__(env)  # type: ignore[arg-type]
-        if not isinstance(transforms, AuxiliarySpace) or transforms.T_y.ndim != 2:
-            raise TypeError(f"transforms: wanted an AuxiliarySpace of one state, got {transforms}")
+        if not isinstance(env, PlantVectorEnv):
+            raise TypeError(f"env: wanted a PlantVectorEnv, got {env!r}")
         self.plants, self.space, n = env, transforms, env.plant.n
-        held = env.plant.hold(env.target) if u0 is None else np.asarray(u0, dtype=float)
-        self.u0 = np.broadcast_to(held, (n,)).copy()
+        if not isinstance(transforms, AuxiliarySpace) or transforms.T_y.shape != (n, n):
+            raise TypeError(f"transforms: wanted an AuxiliarySpace of {n}, got {transforms!r}")
+        self.u0 = _command("u0", env.plant.hold(env.target) if u0 is None else u0, n)
         self.integral = np.zeros((env.num_envs, n))
-        self.single_observation_space = spaces.Box(-np.inf, np.inf, (2 * n,), np.float32)
-        self.single_action_space = spaces.Box(-np.inf, np.inf, (n,), np.float32)
-        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-        self.action_space = batch_space(self.single_action_space, env.num_envs)
+        seen, action = (spaces.Box(-np.inf, np.inf, (k * n,), np.float32) for k in (2, 1))
+        super().__init__(env.num_envs, seen, action, env.mode)
 
-    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Array32, dict[str, Any]]:
-        """Start episodes; each integral starts with the first error."""
-        obs, info = self.env.reset(seed=seed, options=options)
-        fresh = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs)), dtype=bool)
-        self.integral = np.where(fresh[:, None], 0.0, self.integral)
-        return self._seen(obs, fresh), info
+    def _seed(self, seed: Seed) -> None:
+        self.plants._seed(seed)
 
-    def step(self, actions: ArrayLike) -> Step:
-        """Command u = u0 + T_a a."""
+    def _begin(self, mask: Mask, options: dict[str, Any]) -> Array32:
+        obs = self.plants._begin(mask, options)
+        self.integral = np.where(mask[:, None], 0.0, self.integral)
+        return self._seen(obs, mask)
+
+    def _advance(self, actions: ArrayLike) -> Step:
         a = checked("actions", actions, "N n", N=self.num_envs, n=len(self.u0))
-        u = self.u0 + a @ self.space.T_a.T
-        obs, reward, ended, cut, info = self.env.step(u)
-        seen = self._seen(info.get("final_obs", obs), np.ones(self.num_envs, dtype=bool))
-        if "final_obs" in info:  # the trajectories that ended have started anew
-            info, done = {**info, "final_obs": seen}, ended | cut
-            self.integral = np.where(done[:, None], 0.0, self.integral)
-            seen = np.where(done[:, None], self._seen(obs, done), seen)
-        return seen, reward, ended, cut, info
+        step = self.plants._advance(self.u0 + a @ self.space.T_a.T)
+        return self._seen(step[0], np.ones(self.num_envs, dtype=bool)), *step[1:]
 
-    def _seen(self, obs: Any, add: Mask) -> Array32:
+    def _seen(self, obs: Array32, add: Mask) -> Array32:
+        """What is seen of y; the integral starts with the first error and includes the new."""
         z = (np.asarray(obs, dtype=float) - self.plants.target) @ self.space.T_y.T
         self.integral = self.integral + self.plants.h * z * add[:, None]
         s = np.stack([z, self.integral], axis=-1)
         return s.reshape(self.num_envs, -1).astype(np.float32)
+
+
+def _command(name: str, value: ArrayLike, n: int) -> Array:
+    """A command (n,) from one entry for each, or one for all."""
+    given = checked(name, value)
+    return checked(name, given if given.ndim else np.full(n, given), "n", n=n)

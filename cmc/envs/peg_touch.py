@@ -2,24 +2,114 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike
 
-from cmc.envs.peg_touch_config import INTERFACES, PegShift, PegTouchConfig
-from cmc.envs.vector import Array, Array32, Mask, NativeVectorEnv, Seed, SingleEnv, Step
+from cmc.envs.vector import (
+    Array,
+    Array32,
+    Mask,
+    NativeVectorEnv,
+    SingleEnv,
+    Step,
+    set_counts,
+    set_numbers,
+)
 from cmc.plants import Peg
 from cmc.theory.arrays import checked
 
-__all__ = ["INTERFACES", "PegShift", "PegTouchConfig", "PegTouchEnv", "PegTouchVectorEnv"]
-
+INTERFACES = ("auxiliary", "identity", "raw")
 SAMPLED = ("x0", "z0", "x_d", "f_d", "K_sur", "surface_sin", "surface_cos")
+
+
+@dataclass(frozen=True)
+class PegShift:
+    """True parameters over the nominal ones that the controller believes in (fig:1 c) [-]."""
+
+    tau_x: float = 1.0  # lag of x; the paper's generalisation test: 0.5 and 1.5
+    tau_z: float = 1.0  # lag of z; paper: 0.5 and 1.5
+    K_sur: float = 1.0  # stiffness of the surface; paper: 100 % more, so 2
+    surface: float = 1.0  # both surface coefficients; paper: 0.5 and 1.5
+
+    def __post_init__(self) -> None:
+        set_numbers(self, "", tuple(vars(self)), above=0.0)
+
+
+@dataclass(frozen=True)
+class PegTouchConfig:
+    """Every number of the task; defaults are the training set. Pairs are (low, high)."""
+
+    # Paper, appendix F:
+    tau_x: float = 0.0437  # lag of the horizontal axis [s]
+    tau_z: float = 0.01  # lag of the vertical axis [s]
+    K_sur: tuple[float, float] = (1.0, 31.0)  # surface stiffness [N/m]
+    surface: tuple[float, float] = (-0.01, 0.01)  # both coefficients of the surface profile [m]
+    x_limits: tuple[float, float] = (1.0, 3.0)  # x, and its command (ours) [m]
+    z_limits: tuple[float, float] = (-3.0, 1.0)  # z, and its command (ours) [m]
+    # Our choice (the paper samples what is desired, without a range):
+    x_d: tuple[float, float] = (1.0, 3.0)  # desired position [m]
+    f_d: tuple[float, float] = (-2.5, -0.5)  # desired force [N]; negative, as f <= 0 in contact
+    x0: tuple[float, float] = (1.0, 3.0)  # first position [m]
+    z0: tuple[float, float] = (0.0, 1.0)  # first height [m]: above the surface
+    u0: tuple[float, float] = (2.0, -0.5)  # command to which the policy's output is added [m]
+    h: float = 0.01  # control period, with a zero-order hold on the command [s]
+    horizon: int = 50  # steps in an episode
+    weight_x: float = 0.5  # weight of the position error in the reward [1/m]
+    weight_f: float = 0.5  # weight of the force error in the reward [1/N]
+    force_error_cap: float = 5.0  # force error beyond which the reward falls no further [N]
+    action_limit: float = 3.0  # bound of the declared action space; commands saturate earlier [m]
+    # Our extensions:
+    mount_angle: float = 0.0
+    """Angle between the command axes and the plant's axes [rad]. At 0 it is the paper's plant;
+    elsewhere every entry of f_u is non-zero and T_a is the rotation back."""
+    stiffness_reference: float | None = None
+    """If given, a_2 is multiplied by this over the nominal stiffness [N/m]: R_22 is then the same
+    on every surface and a slope is a loop gain. None is the paper's setting."""
+    interface: str = "auxiliary"
+    """What the policy sees and commands: one of `INTERFACES` (see `PegTouchVectorEnv`)."""
+    shift: PegShift = field(default_factory=PegShift)
+    """What the plant has otherwise than T_y and T_a believe. Paper, fig:1 c."""
+
+    def __post_init__(self) -> None:
+        positive = ["tau_x", "tau_z", "h", "action_limit", "force_error_cap"]
+        ranges = ("surface", "x_limits", "z_limits", "x_d", "f_d", "x0", "z0")
+        if self.stiffness_reference is not None:
+            positive.append("stiffness_reference")
+        set_numbers(self, "", positive, above=0.0)
+        set_numbers(self, "", ("weight_x", "weight_f", "mount_angle"))
+        set_numbers(self, "2", (*ranges, "u0"))
+        set_numbers(self, "2", ("K_sur",), above=0.0)
+        for name in (*ranges, "K_sur"):
+            low, high = getattr(self, name)
+            if low > high:
+                raise ValueError(f"{name}: wanted (low, high), got {(low, high)}")
+        set_counts(self, ("horizon",))
+        if not isinstance(self.shift, PegShift):
+            raise ValueError(f"shift: wanted a PegShift, got {self.shift!r}")
+        if self.interface not in INTERFACES:
+            raise ValueError(f"interface: wanted one of {INTERFACES}, got {self.interface!r}")
+
+    def observation_bounds(self) -> tuple[Array32, Array32]:
+        """Largest observations (4,) the limits and the horizon allow; generous, finite."""
+        c, stiffness = self, self.K_sur[1]
+        amplitude = 2.0 * float(np.hypot(*np.abs(c.surface)))
+        deepest = max(map(abs, c.z_limits)) + c.shift.surface * amplitude
+        force = stiffness * c.shift.K_sur * deepest
+        if c.interface == "raw":
+            lowest = np.array([c.x_limits[0], -force, c.x_d[0], c.f_d[0]])
+            highest = np.array([c.x_limits[1], 0.0, c.x_d[1], c.f_d[1]])
+        else:
+            reach = max(c.x_limits[1], c.x_d[1], c.x0[1]) - min(c.x_limits[0], c.x_d[0], c.x0[0])
+            pull = force + max(map(abs, c.f_d)) + stiffness * amplitude * reach
+            signal, time = np.array([reach, pull]), (c.horizon + 1) * c.h
+            highest = 1.001 * np.stack([signal, time * signal], axis=-1).ravel()
+            lowest = -highest
+        return lowest.astype(np.float32), highest.astype(np.float32)
 
 
 class PegTouchVectorEnv(NativeVectorEnv):
@@ -47,17 +137,12 @@ class PegTouchVectorEnv(NativeVectorEnv):
       force, `-weight_f min(|e_f|, force_error_cap)`.
     - Start: x, z, targets, stiffness and surface are uniform in the configuration's ranges;
       integrals start with the first error. `reset(options={"parameters": {name: value}})` fixes any
-      of `SAMPLED`. `reset(seed=[s_1, ..., s_G])` gives each of G equal groups of trajectories its
-      own random stream, so that what one group sees does not depend on the others.
+      of `SAMPLED`.
     - End: no termination; truncated after `horizon` steps.
     - Info: `privileged` (num_envs, 10) float32, all that a critic needs in training: both errors
       and integrals, x, z, f_d, log stiffness and both surface coefficients, of order one.
 
-    Args:
-        num_envs: trajectories.
-        config: every number of the task; `overrides` replace single fields of it.
-        autoreset_mode: see `NativeVectorEnv`.
-        privileged: whether info carries `privileged`.
+    `overrides` replace single fields of `config`; `privileged` says whether info carries it.
 
     Attributes:
         position: (x, z) [m]. command: last applied (u_x, u_z) [m]. error: y - y_d [m, N].
@@ -77,6 +162,8 @@ class PegTouchVectorEnv(NativeVectorEnv):
         render_mode: str | None = None,
         **overrides: Any,
     ) -> None:
+        if not isinstance(config, PegTouchConfig | None):
+            raise TypeError(f"config: wanted a PegTouchConfig, got {config!r}")
         self.config = c = replace(config or PegTouchConfig(), **overrides)
         action = spaces.Box(-c.action_limit, c.action_limit, (2,), np.float32)
         observation = spaces.Box(*c.observation_bounds(), dtype=np.float32)
@@ -84,15 +171,12 @@ class PegTouchVectorEnv(NativeVectorEnv):
         cosine, sine = np.cos(c.mount_angle), np.sin(c.mount_angle)
         self._mount = np.array([[cosine, -sine], [sine, cosine]])
         self._with_privileged = privileged
-        self._generators: list[np.random.Generator] = []
         self.position, self.integral = np.zeros((num_envs, 2)), np.zeros((num_envs, 2))
         self.command: Array = np.tile(c.u0, (num_envs, 1))
         self.steps = np.zeros(num_envs, dtype=np.int64)
         self.sampled: dict[str, Array] = {}
 
     def _advance(self, actions: ArrayLike) -> Step:
-        if not self.sampled:
-            raise gym.error.ResetNeeded("call reset before step")
         a, c = checked("actions", actions, "N 2", N=self.num_envs), self.config
         if c.stiffness_reference is not None:
             scale = c.stiffness_reference / self.sampled["K_sur"]
@@ -101,10 +185,9 @@ class PegTouchVectorEnv(NativeVectorEnv):
             a = a @ self._mount.T  # in the auxiliary space T_a turns the command back
         low, high = zip(c.x_limits, c.z_limits, strict=True)
         self.command = np.clip(np.asarray(c.u0) + a, low, high)
-        x, z = self.true_peg.step(
-            self.position[:, 0], self.position[:, 1], self.command, c.h
-        )  # exact zero-order hold
-        self.position = np.stack([x, z], axis=-1)
+        x, z = self.position.T
+        moved = self.true_peg.step(x, z, self.command, c.h)  # exact zero-order hold
+        self.position = np.stack(moved, axis=-1)
         self._sense()
         self.integral = self.integral + c.h * self.signal
         self.steps += 1
@@ -144,31 +227,21 @@ class PegTouchVectorEnv(NativeVectorEnv):
             error[1] = error[1] + self._shear() * error[0]  # T_y e, see `transforms`
         self.signal = np.stack(error, axis=-1)
 
-    def _seed(self, seed: Seed) -> None:
-        if isinstance(seed, Sequence):
-            if len(seed) == 0 or self.num_envs % len(seed):
-                raise ValueError(
-                    f"seed: wanted a number of seeds that divides {self.num_envs}, got {len(seed)}"
-                )
-            self._generators = [np.random.default_rng(s) for s in seed]
-        elif seed is not None or not self._generators:
-            VectorEnv.reset(self, seed=seed)
-            self._generators = [self.np_random]
-
     def _begin(self, mask: Mask, options: dict[str, Any]) -> Array32:
         c, fixed = self.config, options.get("parameters", {})
-        unknown = set(fixed) - set(SAMPLED)
-        if unknown:
-            raise ValueError(f"parameters: wanted names in {SAMPLED}, got {sorted(unknown)}")
+        if not isinstance(fixed, dict) or set(fixed) - set(SAMPLED):
+            raise ValueError(f"parameters: wanted values by name, of {SAMPLED}, got {fixed!r}")
         ranges = [getattr(c, name.split("_")[0] if "surface" in name else name) for name in SAMPLED]
         low, high = np.array(ranges).T
-        group = self.num_envs // len(self._generators)
-        unit = np.concatenate([g.random((group, len(SAMPLED))) for g in self._generators])
-        drawn = low + (high - low) * unit
-        for index, name in enumerate(SAMPLED):
-            value = checked(f"parameters: {name}", fixed.get(name, drawn[:, index]))
-            value = np.broadcast_to(value, mask.shape)
-            self.sampled[name] = np.where(mask, value, self.sampled.get(name, value))
+        drawn = dict(zip(SAMPLED, self._draw(low, high, len(SAMPLED)).T, strict=True))
+        for name, value in fixed.items():
+            found = checked(label := f"parameters: {name}", value)
+            found = found if found.ndim else np.full(self.num_envs, found)
+            least = 0.0 if name == "K_sur" else None
+            drawn[name] = checked(label, found, "N", N=self.num_envs, above=least)
+        for name, value in drawn.items():
+            kept = self.sampled.get(name, value)
+            self.sampled[name] = np.asarray(np.where(mask, value, kept), dtype=float)
         start = np.stack([self.sampled["x0"], self.sampled["z0"]], axis=-1)
         self.position = np.where(mask[:, None], start, self.position)
         self.command = np.where(mask[:, None], c.u0, self.command)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,9 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from cmc import plants
-from cmc.envs.vector import Array32, Mask, NativeVectorEnv, Seed, SingleEnv, Step
+from cmc.envs.vector import Array32, Mask, NativeVectorEnv, SingleEnv, Step
 from cmc.plants import Plant
-from cmc.theory.arrays import checked, count, number
+from cmc.theory.arrays import checked, count, number, refuse_uncallable
 
 Array = NDArray[np.float64]
 Reward = Callable[[Array, Array], Array]
@@ -39,14 +39,13 @@ class PlantVectorEnv(NativeVectorEnv):
         horizon: steps of an episode.
         substeps: of RK4 within h.
         room: how far out y may go.
-        autoreset_mode: see `NativeVectorEnv`.
-        render_mode: None.
 
     Attributes:
         y: states (N, n). u: commands last applied (N, n).
 
     Raises:
-        ValueError: where an argument is no number of the wanted kind, or f does not answer (N, n).
+        ValueError: where an argument is no number of the wanted kind, or f or the reward answers
+            in another shape.
     """
 
     def __init__(
@@ -64,38 +63,31 @@ class PlantVectorEnv(NativeVectorEnv):
         render_mode: str | None = None,
     ) -> None:
         self.plant = p = plants.get(plant) if isinstance(plant, str) else plant
-        self.h, room = number("h", h), number("room", room)
-        if self.h <= 0.0 or room < 1.0:
-            raise ValueError(f"wanted h > 0 and room >= 1, got h = {h} and room = {room}")
+        if not isinstance(p, Plant):
+            raise TypeError(f"plant: wanted a Plant or the name of one, got {plant!r}")
+        self.h, room = number("h", h, above=0.0), number("room", room, least=1.0)
         self.horizon, self.substeps = count("horizon", horizon), count("substeps", substeps)
         middle, self._half = (p.y_low + p.y_high) / 2, (p.y_high - p.y_low) / 2
         self.target = checked("target", middle if target is None else target, "n", n=p.n)
-        ends = (middle - room * self._half, middle + room * self._half)
+        self._ends = ends = (middle - room * self._half, middle + room * self._half)
         seen = spaces.Box(ends[0].astype(np.float32), ends[1].astype(np.float32))
         command = spaces.Box(p.u_low.astype(np.float32), p.u_high.astype(np.float32))
         super().__init__(num_envs, seen, command, autoreset_mode, render_mode)
-        self._ends, self._reward = ends, reward or self._quadratic
+        self._reward = self._quadratic if reward is None else reward
+        refuse_uncallable("reward", self._reward)
         self.y, self.u = np.tile(middle, (num_envs, 1)), np.zeros((num_envs, p.n))
-        self.steps, self._streams = np.zeros(num_envs, dtype=int), [np.random.default_rng()]
+        self.steps = np.zeros(num_envs, dtype=int)
         if (shape := np.shape(p.f(self.y, self.u))) != self.y.shape:
             raise ValueError(f"f(y, u): wanted shape {self.y.shape}, got {shape}")
 
     def _quadratic(self, y: Array, u: Array) -> Array:
         return -np.mean(((y - self.target) / self._half) ** 2, axis=-1)
 
-    def _seed(self, seed: Seed) -> None:
-        seeds = [seed] if not isinstance(seed, Sequence) else seed
-        if not seeds or self.num_envs % len(seeds):
-            raise ValueError(f"seed: wanted a number that divides {self.num_envs}, got {seed}")
-        if seed is not None:
-            self._streams = [np.random.default_rng(s) for s in seeds]
-
     def _begin(self, mask: Mask, options: dict[str, Any]) -> Array32:
-        p, each = self.plant, self.num_envs // len(self._streams)
-        start = np.concatenate([s.uniform(p.y_low, p.y_high, (each, p.n)) for s in self._streams])
+        p, start = self.plant, self._draw(self.plant.y_low, self.plant.y_high, self.plant.n)
         if "y" in options:
-            given = np.asarray(options["y"])
-            wide = given if given.ndim == 2 else np.tile(given, (self.num_envs, 1))
+            given = checked("y", options["y"], "... n", n=p.n)
+            wide = given if given.ndim > 1 else np.tile(given, (self.num_envs, 1))
             start = checked("y", wide, "N n", N=self.num_envs, n=p.n)
         self.y = np.where(mask[:, None], start, self.y)
         self.u, self.steps = np.where(mask[:, None], 0.0, self.u), np.where(mask, 0, self.steps)
@@ -103,20 +95,19 @@ class PlantVectorEnv(NativeVectorEnv):
 
     def _advance(self, actions: ArrayLike) -> Step:
         p, dt = self.plant, self.h / self.substeps
-        self.u = np.clip(
-            checked("actions", actions, "N n", N=self.num_envs, n=p.n), p.u_low, p.u_high
-        )
+        u = checked("actions", actions, "N n", N=self.num_envs, n=p.n)
+        self.u = u = np.clip(u, p.u_low, p.u_high)
         for _ in range(self.substeps):
-            k1 = np.asarray(p.f(self.y, self.u))
-            k2 = np.asarray(p.f(self.y + dt / 2 * k1, self.u))
-            k3 = np.asarray(p.f(self.y + dt / 2 * k2, self.u))
-            k4 = np.asarray(p.f(self.y + dt * k3, self.u))
+            k1 = np.asarray(p.f(self.y, u))
+            k2 = np.asarray(p.f(self.y + dt / 2 * k1, u))
+            k3 = np.asarray(p.f(self.y + dt / 2 * k2, u))
+            k4 = np.asarray(p.f(self.y + dt * k3, u))
             self.y = self.y + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         low, high = self._ends
         self.y = np.clip(np.nan_to_num(self.y, nan=np.inf), low, high)
         self.steps = self.steps + 1
         left = np.any((self.y <= low) | (self.y >= high), axis=-1)
-        reward = np.asarray(self._reward(self.y, self.u), dtype=float)
+        reward = checked("reward", self._reward(self.y, u), "N", N=self.num_envs)
         return self.y.astype(np.float32), reward, np.asarray(left), self.steps >= self.horizon, {}
 
 

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from cmc.theory.arrays import checked, count, number
+from cmc.theory.arrays import checked, count
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -24,7 +24,9 @@ Seed = int | Sequence[int | None] | None
 class NativeVectorEnv(VectorEnv[Array32, ArrayLike, Any]):
     """Resets and ends of `num_envs` trajectories; a subclass begins, advances and describes them.
 
-    `autoreset_mode` is one of Gymnasium's, as `AutoresetMode` or text ("NextStep", "next_step"):
+    `reset(seed=[s_1, ..., s_G])` gives each of G equal groups of trajectories its own random
+    stream, so that what one group sees does not depend on the others. `autoreset_mode` is one of
+    Gymnasium's, as `AutoresetMode` or text ("NextStep", "next_step"):
 
     - SAME_STEP: an ended trajectory starts anew in the step that ends it; `info` then has
       `final_obs` and `final_info`, with the masks `_final_obs` and `_final_info`;
@@ -32,7 +34,9 @@ class NativeVectorEnv(VectorEnv[Array32, ArrayLike, Any]):
     - DISABLED: when `reset(options={"reset_mask": ...})` says so.
 
     Raises:
-        ValueError: for another mode, any render mode, or a mask of another shape.
+        ValueError: for another mode, bad seeds, or a mask of another shape.
+        TypeError: for any render mode.
+        ResetNeeded: for a step before the first reset.
     """
 
     def __init__(
@@ -54,11 +58,18 @@ class NativeVectorEnv(VectorEnv[Array32, ArrayLike, Any]):
         self.single_action_space: Any = action
         self.observation_space = batch_space(observation, num_envs)
         self.action_space = batch_space(action, num_envs)
-        self._ended = np.zeros(num_envs, dtype=bool)
+        self._ended, self._begun = np.zeros(num_envs, dtype=bool), False
+        self._streams = [np.random.default_rng()]
 
-    @abstractmethod
     def _seed(self, seed: Seed) -> None:
         """Set the random streams; None keeps them."""
+        if seed is not None:
+            self._streams = generators(seed, self.num_envs)
+
+    def _draw(self, low: Array, high: Array, size: int) -> Array:
+        """Uniform draws for all trajectories, (N, size), each from its group's stream."""
+        shape = self.num_envs // len(self._streams), size
+        return np.concatenate([stream.uniform(low, high, shape) for stream in self._streams])
 
     @abstractmethod
     def _begin(self, mask: Mask, options: dict[str, Any]) -> Array32:
@@ -77,15 +88,18 @@ class NativeVectorEnv(VectorEnv[Array32, ArrayLike, Any]):
     ) -> tuple[Array32, dict[str, Any]]:
         """Start new trajectories, all of them or those of `options["reset_mask"]`."""
         options = options or {}
+        if not isinstance(options, dict):
+            raise TypeError(f"options: wanted a dictionary, got {options!r}")
+        mask = masked("reset_mask", options.get("reset_mask"), self.num_envs)
         self._seed(seed)
-        mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs)), dtype=bool)
-        if mask.shape != (self.num_envs,):
-            raise ValueError(f"reset_mask: wanted shape ({self.num_envs},), got {mask.shape}")
         self._ended = self._ended & ~mask
-        return self._begin(mask, options), self._describe({})
+        obs, self._begun = self._begin(mask, options), True
+        return obs, self._describe({})
 
     def step(self, actions: ArrayLike) -> Step:
         """One step of every trajectory."""
+        if not self._begun:
+            raise gym.error.ResetNeeded("call reset before step")
         obs, reward, terminated, truncated, info = self._advance(actions)
         if self.mode is AutoresetMode.NEXT_STEP and self._ended.any():
             fresh, reward = self._ended, np.where(self._ended, 0.0, reward)
@@ -126,21 +140,44 @@ class SingleEnv(gym.Env[Array32, Array32]):
 
     def step(self, action: ArrayLike) -> tuple[Array32, float, bool, bool, dict[str, Any]]:
         """One step; see the vector environment for the action."""
-        obs, reward, ended, truncated, info = self.batch.step(np.asarray(action)[None])
+        actions = action[None] if isinstance(action, np.ndarray) else [action]
+        obs, reward, ended, truncated, info = self.batch.step(actions)
         return obs[0], reward.item(), ended.item(), truncated.item(), _each(info, _first)
 
 
-def set_numbers(config: Any, shape: str, names: Sequence[str], above: float | None = None) -> None:
+def generators(seed: Seed, num: int) -> list[np.random.Generator]:
+    """A random stream for each seed; the number of seeds divides `num`."""
+    try:
+        seeds: list[Any] = [seed] if np.ndim(seed) == 0 else list(seed)  # type: ignore
+        if num % len(seeds) == 0:
+            return [np.random.default_rng(s) for s in seeds]
+    except (TypeError, ValueError, ZeroDivisionError):  # numpy does not say whose number was bad
+        pass
+    raise ValueError(
+        f"seed: wanted a whole number of at least 0, or a number of them that divides {num}, "
+        f"got {seed!r}"
+    )
+
+
+def masked(name: str, mask: ArrayLike | None, num: int) -> Mask:
+    """Which of `num` trajectories are meant, (num,); without a mask, all."""
+    found = np.ones(num, bool) if mask is None else np.asarray(mask)
+    if found.shape != (num,) or found.dtype != bool:
+        raise ValueError(f"{name}: wanted {num} of True and False, got {mask!r}")
+    return found
+
+
+def set_numbers(config: Any, shape: str, names: Sequence[str], **limits: float) -> None:
     """Turn fields of a frozen dataclass into finite floats, or tuples of them (JSON has lists)."""
     for name in names:
-        found = checked(name, getattr(config, name), shape, above=above).tolist()
+        found = checked(name, getattr(config, name), shape, **limits).tolist()  # type: ignore[arg-type]
         object.__setattr__(config, name, tuple(found) if shape else found)
 
 
 def set_counts(config: Any, names: Sequence[str]) -> None:
     """Turn fields of a frozen dataclass into whole numbers of at least 1."""
     for name in names:
-        object.__setattr__(config, name, count(name, number(name, getattr(config, name))))
+        object.__setattr__(config, name, count(name, getattr(config, name)))
 
 
 def _each(info: dict[str, Any], change: Callable[[NDArray[Any]], Any]) -> dict[str, Any]:
@@ -156,9 +193,8 @@ def _first(value: NDArray[Any]) -> Any:
 
 
 def _mode(mode: AutoresetMode | str) -> AutoresetMode:
-    names = {m.value.lower(): m for m in AutoresetMode}
-    found = names.get(str(getattr(mode, "value", mode)).lower().replace("_", ""))
-    if found is None:
-        wanted = ", ".join(m.value for m in AutoresetMode)
-        raise ValueError(f"autoreset_mode: wanted one of {wanted}, got {mode!r}")
-    return found
+    for found in AutoresetMode:
+        if mode is found or str(mode).lower().replace("_", "") == found.value.lower():
+            return found
+    wanted = ", ".join(found.value for found in AutoresetMode)
+    raise ValueError(f"autoreset_mode: wanted one of {wanted}, got {mode!r}")

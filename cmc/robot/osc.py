@@ -1,4 +1,4 @@
-r"""Operational-space control of the Panda's peg tip, and the latent model made of its gains.
+r"""Operational-space control of the Panda's peg tip, its latent model, and the worlds under it.
 
 With e = x_d - x (three metres, three radians), u the low-level action and
 
@@ -17,7 +17,7 @@ Jbar = M^-1 J^T L in the second. Without M in front, the posture term would move
 
 With y = K1 e + K2 e' the loop becomes A y' + B y + u = 0 (`LTI`), so any u = pi(y) with positive
 slope contracts; held for dt it must also keep (K_d + g K2) dt < 2, where g = d pi / d y. The law
-itself is compiled, in `cmc.robot.tick`.
+itself is compiled, in `cmc.robot.tick`; `Worlds` is its face: physics seen through arrays.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from typing import Any, Literal
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from cmc.robot.panda import JOINTS, READY
-from cmc.robot.tick import LAW, ROW, refresh, torque
-from cmc.theory.arrays import checked, number
+from cmc.robot.panda import DOWN, JOINTS, READY
+from cmc.robot.tick import LAW, ROW, refresh, tick
+from cmc.theory.arrays import checked, count, number
 from cmc.theory.composite import CompositeModel, composite
 
 Array = NDArray[np.float64]
-Form = Literal["acceleration", "force"]
+_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,8 @@ class Gains:
     kd_rot: float
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            number(name, value, least=0.0)
         _ = self.latent
 
     @property
@@ -87,7 +89,7 @@ class ControlLaw:
     `pivot_floor`, so that singular poses give bounded torques; elsewhere the control is exact.
     """
 
-    form: Form = "force"
+    form: Literal["acceleration", "force"] = "force"
     split: bool = False
     error_limit: float | None = None  # the translation error is shortened to this length, m
     posture: tuple[float, ...] = tuple(READY.tolist())  # what the null space returns to, rad
@@ -99,15 +101,134 @@ class ControlLaw:
     def __post_init__(self) -> None:
         if self.form not in ("acceleration", "force"):
             raise ValueError(f"form must be 'acceleration' or 'force', got {self.form!r}")
+        for name in ("split", "drift"):
+            if not isinstance(getattr(self, name), bool):
+                raise TypeError(f"{name}: wanted True or False, got {getattr(self, name)!r}")
         if self.split and self.form != "force":
             raise ValueError("split blocks exist for the force form only")
         if self.error_limit is not None:
             number("error_limit", self.error_limit, above=0.0)
         checked("posture", self.posture, str(JOINTS))
+        for name in ("posture_stiffness", "posture_damping"):
+            number(name, getattr(self, name), least=0.0)
+        number("pivot_floor", self.pivot_floor, above=0.0)
 
 
-def describe(model: mujoco.MjModel, gains: Gains, law: ControlLaw, **more: Any) -> NDArray[np.void]:
-    """The `LAW` of a scene, (1,); `more` sets further fields of it."""
+class Worlds:
+    """`num` worlds of a scene whose contact sensors remember the physics steps of a tick.
+
+    A tick lasts `substeps` physics steps; the torque is held over it, or computed at every one.
+    `law` and `more` are the fields of `cmc.robot.tick.LAW`. The arrays below are live views of the
+    worlds' records, `rows`; after a change of a target, `refresh`.
+    """
+
+    target: Array  # where the tip is to go, (N, 3), m
+    quat: Array  # and how the hand is to be turned, (N, 4)
+    target_joints: Array  # the same for joint control, (N, 7), rad
+    tip: Array  # the true tip, (N, 3), m
+    nominal: Array  # the tip that is fixed to the hand, (N, 3), m
+    rotation: Array  # of the hand, a rotation vector from pointing straight down, (N, 3), rad
+    signals: Array  # control error towards the target and velocity of the nominal tip, (N, 12)
+    latent: Array  # y = K1 e + K2 e', (N, 6)
+    integral: Array  # of its translation, tick by tick, (N, 6)
+    force: Array  # net contact force on the peg at the end of the tick, (N, 3), N
+    peaks: Array  # largest |force|, N, and penetration, m, of the tick's physics steps, (N, 2)
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        gains: Gains,
+        law: ControlLaw,
+        num: int = 1,
+        substeps: int = 1,
+        **more: Any,
+    ) -> None:
+        self.model, self.num = model, count("worlds", num)
+        if (
+            min(model.sensor_history[model.sensor(name).id][0] for name in _CONTACT.values())
+            < substeps
+        ):
+            raise ValueError(f"model: wanted sensors with a history of {substeps} (`load_scene`)")
+        self._law = _describe(model, gains, law, substeps=substeps, **more)
+        self._hand, self._actions = model.body("hand").id, (num, JOINTS if more.get("joint") else 6)
+        self.data = [mujoco.MjData(model) for _ in range(num)]
+        self.rows, self._jacobians = np.zeros(num, ROW), np.zeros((num, 6, model.nv))
+        for row, data in zip(self.rows, self.data, strict=True):
+            _bind(row, model, data, substeps)
+        for name in Worlds.__annotations__:
+            setattr(self, name, self.rows[name])
+        self._qpos, self._qvel = ([getattr(d, n) for d in self.data] for n in ("qpos", "qvel"))
+        self.quat[:] = DOWN
+        self.reset(np.zeros((num, model.nq)), np.ones(num, dtype=bool))
+
+    @property
+    def qpos(self) -> Array:
+        """Joint positions (N, nq), a copy."""
+        return np.array(self._qpos)
+
+    @property
+    def qvel(self) -> Array:
+        """Joint velocities (N, nv), a copy."""
+        return np.array(self._qvel)
+
+    def reset(self, qpos: Array, mask: NDArray[np.bool_]) -> None:
+        """Put the masked worlds at rest at `qpos` (N, nq)."""
+        for k in np.flatnonzero(mask):
+            mujoco.mj_resetData(self.model, self.data[k])
+            self._qpos[k][:] = qpos[k]
+            mujoco.mj_step1(self.model, self.data[k])
+        self.force[mask], self.peaks[mask] = 0.0, 0.0
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Observe the current states and compute errors towards the targets."""
+        refresh(self.rows, self._law, self._jacobians)
+
+    def tick(self, actions: ArrayLike) -> None:
+        """One tick; actions (N, 6), or (N, 7) of joint control, in units of `u_limit`."""
+        num, size = shape = self._actions
+        floats = isinstance(actions, np.ndarray) and actions.dtype.kind == "f"
+        if not floats or np.shape(actions) != shape:  # always `checked`: a tenth of a tick more
+            actions = checked("low-level action", actions, "N size", N=num, size=size)
+        values = np.array(actions, dtype=np.float64, order="C")
+        if not tick(self.rows, self._law, self._jacobians, values):
+            checked("low-level action", values)
+
+    def push(self, force: ArrayLike) -> None:
+        """Let an external force (N, 3), N, act on the nominal tip, in world axes.
+
+        Force and moment are those of the hand's present pose and last until the next push or reset;
+        repeated at every tick, the force follows the tip. Zero takes it away.
+        """
+        forces = checked("push", force, "N 3", N=self.num)
+        # MuJoCo applies forces at the centre of mass.
+        arm = self.model.site("tip_nominal").pos - self.model.body("hand").ipos
+        for data, f in zip(self.data, forces, strict=True):
+            lever = data.xmat[self._hand].reshape(3, 3) @ arm
+            data.xfrc_applied[self._hand] = np.concatenate([f, np.cross(lever, f)])
+
+    def get_state(self) -> Array:
+        """Physics states (N, size), enough to continue exactly."""
+        states = np.empty((self.num, mujoco.mj_stateSize(self.model, _STATE)))
+        for data, state in zip(self.data, states, strict=True):
+            mujoco.mj_getState(self.model, data, state, _STATE)
+        return states
+
+    def set_state(self, states: Array) -> None:
+        """Restore what `get_state` returned."""
+        for data, state in zip(self.data, states, strict=True):
+            mujoco.mj_setState(self.model, data, state, _STATE)
+            mujoco.mj_step1(self.model, data)
+        self.refresh()
+
+
+_CONTACT = {"forces": "peg_force", "distances": "peg_distance"}
+
+
+def _describe(
+    model: mujoco.MjModel, gains: Gains, law: ControlLaw, **more: Any
+) -> NDArray[np.void]:
+    """The `LAW` of a scene, (1,)."""
     site, joints = model.site("tip_nominal").id, {model.joint(k).name for k in range(model.njnt)}
     values = {**vars(law), **more, "model": model._address, "nv": model.nv, "site": site}
     values |= {"body": model.site_bodyid[site], "acceleration": values.pop("form") != "force"}
@@ -119,7 +240,7 @@ def describe(model: mujoco.MjModel, gains: Gains, law: ControlLaw, **more: Any) 
     return answer
 
 
-def bind(row: NDArray[np.void], model: mujoco.MjModel, data: mujoco.MjData, steps: int = 0) -> None:
+def _bind(row: NDArray[np.void], model: mujoco.MjModel, data: mujoco.MjData, steps: int) -> None:
     """Write the addresses that law and tick read; `data` must outlive the row.
 
     A sensor's history is two numbers of bookkeeping, `steps` times, and a ring of values.
@@ -129,59 +250,9 @@ def bind(row: NDArray[np.void], model: mujoco.MjModel, data: mujoco.MjData, step
     arrays |= {"passive": data.qfrc_passive, "hand_mat": data.xmat[hand]}
     arrays |= {"site_pos": data.site_xpos[site], "site_mat": data.site_xmat[site]}
     arrays |= {"tip_pos": data.site("tip").xpos, "push": data.sensor("peg_force").data}
-    for name, sensor in (("forces", "peg_force"), ("distances", "peg_distance")):
+    for name, sensor in _CONTACT.items():
         start = int(model.sensor_historyadr[model.sensor(sensor).id]) + 2 + steps
         arrays[name] = data.history[start:]
     row["data"] = data._address
     for name, array in arrays.items():
         row[name] = array.ctypes.data
-
-
-class TaskSpaceController:
-    """Torque that moves the tip of one simulated Panda, from `load_scene`, towards a target pose.
-
-    Reads positions, velocities, inertia and bias from MuJoCo's data, which must be current
-    (`mj_step1` or `mj_forward`). When last observed, the tip had the velocity `velocity`, linear
-    and angular, (6,), m/s and rad/s, and for the seven joints the Jacobian `jac`, (6, 7). The tip
-    is the one that is fixed to the hand, the site "tip_nominal".
-    """
-
-    def __init__(self, model: mujoco.MjModel, gains: Gains, law: ControlLaw | None = None) -> None:
-        self.model, self.gains, self._law = (
-            model,
-            gains,
-            describe(model, gains, law or ControlLaw()),
-        )
-        self._row, self._jac = np.zeros(1, ROW), np.zeros((1, 6, model.nv))
-        self.velocity, self.jac = self._row["signals"][0, 6:], self._jac[0, :, :JOINTS]
-
-    def observe(self, data: mujoco.MjData) -> None:
-        """Read pose, Jacobian and velocity of the tip from the current state."""
-        self._data = data  # its arrays are read by address
-        bind(self._row[0], self.model, data)
-        refresh(self._row, self._law, self._jac)
-
-    def error(self, position: Array, quat: Array) -> Array:
-        """Pose error e = (x_d - x, rotation vector from x to x_d in the world frame), (6,).
-
-        Of the state last observed, towards a position, m, and a unit quaternion (w, x, y, z). The
-        rotation is the log map; the translation is shortened to the law's error limit.
-        """
-        self._row["target"], self._row["quat"] = position, quat
-        refresh(self._row, self._law, self._jac)
-        return self._row["signals"][0, :6].copy()
-
-    def torque(self, data: mujoco.MjData, position: Array, quat: Array, u: Array) -> Array:
-        """Joint torques (7,), N m, towards a pose as in `error`, before the motors' limits.
-
-        The low-level action u, (6,), m/s^2 and rad/s^2, moves the tip towards +x where positive.
-        """
-        self.observe(data)
-        error = self.error(position, quat)
-        return self.torque_for(self.gains.kp * error - self.gains.kd * self.velocity + u)  # 2nd_sys
-
-    def torque_for(self, reference: Array) -> Array:
-        """Joint torques (7,) for the tip acceleration `reference` (6,), in the state observed."""
-        tau = np.zeros(self._jac.shape[-1])
-        torque(self._row, self._law, self._jac, np.array(reference, dtype=float), tau)
-        return tau[:JOINTS]

@@ -48,10 +48,9 @@ class Peg:
     mass: float = 0.03  # kg; part of the hand's load when the mount is rigid
 
     def __post_init__(self) -> None:
-        for name in ("length", "radius", "mass"):
-            number(f"peg {name}", getattr(self, name), above=0.0)
-        for name in ("stiffness", "damping"):
-            number(f"peg {name}", getattr(self, name), least=0.0)
+        for name, value in vars(self).items():
+            spring = name in ("stiffness", "damping")
+            number(f"peg {name}", value, **({"least": 0.0} if spring else {"above": 0.0}))
         if self.length <= 2 * self.radius:
             raise ValueError(f"a peg of radius {self.radius} m must be longer than {self.length} m")
 
@@ -71,9 +70,11 @@ def load_scene(
         ValueError: if the file is missing, does not parse, or holds no peg, and if the physics step
             `timestep` is not in (0, 5 ms]: contact needs two steps in 10 ms.
     """
-    spec = scene_spec(scene, peg, timestep)
+    spec, steps = scene_spec(scene, peg, timestep), number("history", history, least=0.0)
+    if steps % 1:
+        raise ValueError(f"history: wanted a whole number of steps, got {history}")
     for sensor in spec.sensors:
-        sensor.nsample = history
+        sensor.nsample = int(steps)
     try:
         return spec.compile()
     except ValueError as error:
@@ -84,8 +85,10 @@ def scene_spec(
     scene: str | Path = "panda.xml", peg: Peg | None = None, timestep: float = 0.002
 ) -> mujoco.MjSpec:
     """The same scene before it is compiled, for what needs its MJCF text; see `load_scene`."""
-    if not 0 < timestep <= 0.005:
-        raise ValueError(f"the physics step must be in (0, 0.005] s, got {timestep}")
+    if number("timestep", timestep, above=0.0) > 0.005:
+        raise ValueError(f"timestep: the physics step must be in (0, 0.005] s, got {timestep}")
+    if not isinstance(scene, str | Path) or not isinstance(peg, Peg | None):
+        raise TypeError(f"scene and peg: wanted a name and a Peg, got {scene!r} and {peg!r}")
     try:
         path = Path(scene) if Path(scene).is_file() else asset("scenes", str(scene))
         spec = mujoco.MjSpec.from_file(str(path))
@@ -137,10 +140,15 @@ def inverse_kinematics(
     """
     target, orientation = checked("position", position, "3"), checked("quat", quat, "4")
     orientation = orientation / number("length of quat", np.linalg.norm(orientation), above=0.0)
+    tolerance = number("tolerance", tolerance, above=0.0)
     model = _bare_arm()
     data, hand = mujoco.MjData(model), model.body("hand").id
-    jac, error, offset = np.zeros((6, model.nv)), np.zeros(6), np.array([0.0, 0.0, tool])
-    q = np.clip(np.asarray(q0, float), LOWER, UPPER)
+    jac, error, offset = (
+        np.zeros((6, model.nv)),
+        np.zeros(6),
+        np.array([0.0, 0.0, number("tool", tool)]),
+    )
+    q = np.clip(checked("q0", q0, "7"), LOWER, UPPER)
     for _ in range(100):
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)

@@ -243,8 +243,8 @@ def refresh(rows: Record, laws: Record, jacs: Array) -> None:
 
 
 @compiled
-def tick(rows: Record, laws: Record, jacs: Array, actions: Array, start: int, stop: int) -> bool:
-    """One tick of the worlds from `start` to `stop`; False, and nothing done, without numbers.
+def tick(rows: Record, laws: Record, jacs: Array, actions: Array) -> bool:
+    """One tick; False, and nothing done, without finite numbers.
 
     Actions (N, 6 or 7) are in units of `u_limit`, and clipped to [-1, 1].
     """
@@ -253,7 +253,7 @@ def tick(rows: Record, laws: Record, jacs: Array, actions: Array, start: int, st
         if not np.isfinite(value):
             return False
     tau, u = np.zeros(law.nv), np.zeros(JOINTS)
-    for k in range(start, stop):
+    for k in range(len(rows)):
         w, jac = rows[k], jacs[k]
         for i in range(actions.shape[1]):
             u[i] = law.u_limit[i] * min(max(actions[k, i], -1.0), 1.0)
@@ -289,9 +289,3 @@ def _contact(w: Any, steps: int) -> None:
         largest = max(largest, forces[i, 0] ** 2 + forces[i, 1] ** 2 + forces[i, 2] ** 2)
         nearest = min(nearest, distances[i])
     w.peaks[0], w.peaks[1] = np.sqrt(largest), -nearest
-
-
-@compiled
-def torque(rows: Record, laws: Record, jacs: Array, reference: Array, tau: Array) -> None:
-    """Torque of the law for one world that was last looked at in its present state."""
-    _torque(rows[0], laws[0], jacs[0], reference, tau)

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmc.theory.arrays import checked
+from cmc.theory.arrays import checked, increasing, number, refuse_uncallable, together
 
 Array = NDArray[np.float64]
 TorqueLaw = Callable[[float, Array, Array], Array]
@@ -24,7 +25,8 @@ TorqueLaw = Callable[[float, Array, Array], Array]
 class TwoLinkArm:
     """Uniform links, m and kg, under gravity along -y, m/s^2; methods take (..., 2) arrays.
 
-    The inertia of a link about its center is m l^2 / 12.
+    The inertia of a link about its center is m l^2 / 12. Wrong shapes and what is not finite raise
+    ValueError, or TypeError, with the argument's name.
     """
 
     lengths: tuple[float, float] = (0.4, 0.3)
@@ -34,10 +36,11 @@ class TwoLinkArm:
     def __post_init__(self) -> None:
         for name in ("lengths", "masses"):
             checked(name, getattr(self, name), "2", above=0.0)
+        number("gravity", self.gravity)
 
-    def _along(self, q: ArrayLike, first: ArrayLike, second: ArrayLike) -> Array:
+    def _along(self, q: ArrayLike, first: Any, second: Any) -> Array:
         """Sum of a vector along each link, of the given sizes, (..., 2)."""
-        q = np.asarray(q, dtype=float)
+        q = _pair("q", q)
         a, b = q[..., 0], q[..., 0] + q[..., 1]
         x, y = first * np.cos(a) + second * np.cos(b), first * np.sin(a) + second * np.sin(b)
         return np.stack([x, y], -1)
@@ -53,13 +56,13 @@ class TwoLinkArm:
 
     def jacobian_rate(self, q: ArrayLike, dq: ArrayLike) -> Array:
         """J' q', the tip acceleration at q'' = 0, (..., 2), m/s^2: centripetal terms only."""
-        dq, (l1, l2) = np.asarray(dq, dtype=float), self.lengths
+        dq, (l1, l2) = _pair("dq", dq), self.lengths
         return -self._along(q, l1 * dq[..., 0] ** 2, l2 * (dq[..., 0] + dq[..., 1]) ** 2)
 
     def inertia(self, q: ArrayLike) -> Array:
         """Mass matrix H(q), (..., 2, 2), kg m^2."""
         (l1, l2), (m1, m2) = self.lengths, self.masses
-        cross = m2 * l1 * l2 / 2 * np.cos(np.asarray(q, dtype=float)[..., 1])
+        cross = m2 * l1 * l2 / 2 * np.cos(_pair("q", q)[..., 1])
         h22 = m2 * l2**2 / 3 + 0 * cross
         h12 = h22 + cross
         h11 = m1 * l1**2 / 3 + m2 * l1**2 + h22 + 2 * cross
@@ -67,7 +70,7 @@ class TwoLinkArm:
 
     def bias(self, q: ArrayLike, dq: ArrayLike) -> Array:
         """C(q, q') q' + g(q), (..., 2), N m."""
-        q, dq = np.asarray(q, dtype=float), np.asarray(dq, dtype=float)
+        q, dq = _pair("q", q), _pair("dq", dq)
         (l1, l2), (m1, m2) = self.lengths, self.masses
         h = -m2 * l1 * l2 / 2 * np.sin(q[..., 1])
         elbow = m2 * l2 / 2 * np.cos(q[..., 0] + q[..., 1]) * self.gravity
@@ -77,7 +80,7 @@ class TwoLinkArm:
 
     def acceleration(self, q: ArrayLike, dq: ArrayLike, tau: ArrayLike) -> Array:
         """Joint acceleration q'' under torques, (..., 2), rad/s^2."""
-        rest = np.asarray(tau, dtype=float) - self.bias(q, dq)
+        rest = _pair("tau", tau) - self.bias(q, dq)
         return np.asarray(np.linalg.solve(self.inertia(q), rest[..., None])[..., 0], dtype=float)
 
     def task_torque(self, q: ArrayLike, dq: ArrayLike, p: ArrayLike) -> Array:
@@ -92,7 +95,7 @@ class TwoLinkArm:
         jac = self.jacobian(q)
         if np.any(np.abs(np.linalg.det(jac)) < 1e-3 * self.lengths[0] * self.lengths[1]):
             raise ValueError(f"the arm is straight or folded at q = {q!r}: J has no inverse")
-        wanted = np.asarray(p, dtype=float) - self.jacobian_rate(q, dq)
+        wanted = _pair("p", p) - self.jacobian_rate(q, dq)
         ddq = np.linalg.solve(jac, wanted[..., None])
         return (self.inertia(q) @ ddq)[..., 0] + self.bias(q, dq)  # tau_task_space_control
 
@@ -102,13 +105,17 @@ class TwoLinkArm:
         Raises:
             ValueError: for points outside the annulus that the arm reaches.
         """
-        x, (l1, l2) = np.asarray(x, dtype=float), self.lengths
+        x, (l1, l2) = _pair("x", x), self.lengths
         cosine = (np.sum(x**2, axis=-1) - l1**2 - l2**2) / (2 * l1 * l2)
-        if not np.all(np.abs(cosine) <= 1.0):
-            raise ValueError(f"the tip reaches {abs(l1 - l2):g} to {l1 + l2:g} m, got {x}")
+        if np.any(np.abs(cosine) > 1.0):
+            raise ValueError(f"x: the tip reaches {abs(l1 - l2):g} to {l1 + l2:g} m, got {x}")
         second = np.arccos(cosine)
         inner = np.arctan2(l2 * np.sin(second), l1 + l2 * np.cos(second))
         return np.stack([np.arctan2(x[..., 1], x[..., 0]) - inner, second], -1)
+
+
+def _pair(name: str, value: ArrayLike) -> Array:
+    return checked(name, value, "... 2")
 
 
 def simulate(
@@ -118,10 +125,14 @@ def simulate(
 
     The torque `law(t, q, q')`, N m, is held between two times, each one Runge-Kutta step (RK4).
     """
-    times = np.asarray(times, dtype=float)
-    path = [np.stack([np.asarray(q, dtype=float), np.asarray(dq, dtype=float)])]
+    refuse_uncallable("law", law)
+    times, (start, speed) = (
+        increasing("times", times),
+        together(q=_pair("q", q), dq=_pair("dq", dq)),
+    )
+    path = [np.stack([start, speed])]
     for t, h in zip(times, np.diff(times), strict=False):
-        tau, state = law(float(t), *path[-1]), path[-1]
+        tau, state = _pair("law(t, q, dq)", law(float(t), *path[-1])), path[-1]
 
         def rate(s: Array, tau: Array = tau) -> Array:
             return np.stack([s[1], arm.acceleration(s[0], s[1], tau)])

@@ -32,8 +32,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from cmc.envs.peg_touch import PegTouchVectorEnv
-from cmc.envs.peg_touch_config import PegTouchConfig
+from cmc.envs.peg_touch import PegTouchConfig, PegTouchVectorEnv
 from cmc.learning.ppo import PPO, PPOConfig
 from cmc.policies import (
     ConvexGradientNetwork,

@@ -11,8 +11,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from cmc.envs.peg_touch import PegTouchVectorEnv
-from cmc.envs.peg_touch_config import PegShift, PegTouchConfig
+from cmc.envs.peg_touch import PegShift, PegTouchConfig, PegTouchVectorEnv
 from cmc.plants import Lags
 from cmc.policies import ConvexGradientNetwork, ModularPolicy
 from cmc.studies.study import Array, Rows, Test, same

@@ -23,10 +23,9 @@ import mujoco
 import numpy as np
 import pandas as pd
 
-from cmc.envs.panda_task import PandaTask
+from cmc.envs.panda_task import PandaTask, PandaTaskConfig
 from cmc.envs.peg_maze import SOFT, STIFF, PegMaze
 from cmc.envs.vector import Array
-from cmc.envs.worlds import PandaTaskConfig
 from cmc.studies.study import changed
 
 SLOPE = 20.0 * np.array([1.0] * 3 + [0.1] * 3)

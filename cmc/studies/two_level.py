@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from cmc.envs.panda_task import HIGH_LEVEL, PandaTask
-from cmc.envs.worlds import PandaTaskConfig
+from cmc.envs.panda_task import HIGH_LEVEL, PandaTask, PandaTaskConfig
 from cmc.learning.hierarchy import HierarchyConfig, TwoLevel
 from cmc.learning.hiro import JointLow, JointUnits, OffPolicyCorrection, PullActor
 from cmc.learning.latent import LatentConfig, LatentLow, LatentModel
