@@ -37,6 +37,7 @@ def run() -> Iterator[dict[str, str | float]]:
                 "one": _ticks(task(config, 1)),
                 "gym": _gym(name),
                 "many": _ticks(task(config, 32)),
+                "shared": _ticks(task(config, 32, threads=os.cpu_count() or 1)),
                 "every": _ticks(task(every, 1)),
                 "every_many": _ticks(task(every, 32)),
             }
@@ -45,6 +46,7 @@ def run() -> Iterator[dict[str, str | float]]:
         yield {"name": f"{name}: one world", "ratio": cost["one"] / raw, "us": 1e6 * cost["one"]}
         yield {"name": f"{name}: through gymnasium", "ratio": cost["gym"] / raw}
         yield {"name": f"{name}: 32 worlds, each", "ratio": cost["many"] / many}
+        yield {"name": f"{name}: same, threads, CPU time", "ratio": cost["shared"] / many}
         yield {"name": f"{name}: control at every step, share", "ratio": raw / cost["every"]}
         yield {"name": f"{name}: same, 32 worlds, share", "ratio": many / cost["every_many"]}
     yield _plan()

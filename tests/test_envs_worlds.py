@@ -157,6 +157,16 @@ def test_joint_control_is_a_spring_an_action_towards_the_goal_and_gravity():
         np.testing.assert_allclose(task.worlds.qpos[0], data.qpos, atol=1e-9)
 
 
+def test_threads_change_nothing():
+    alone, shared = PegPush(PUSH, 5, seed=0), PegPush(PUSH, 5, seed=0, threads=3)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        action = rng.uniform(-1, 1, (5, 6))
+        np.testing.assert_array_equal(alone.step(action)[0], shared.step(action)[0])
+    with pytest.raises(ValueError, match="finite"):
+        shared.step(np.full((5, 6), np.nan))
+
+
 # -- copies --------------------------------------------------------------------------------------
 
 NAMES = ["cmc/PegMaze-v0", "cmc/PegMazeJoint-v0", "cmc/PegPush-v0", "cmc/PegTouch-v0"]

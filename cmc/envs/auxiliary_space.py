@@ -36,6 +36,7 @@ class AuxiliarySpaceWrapper(gym.Wrapper[Array32, Any, Any, Any]):
         transforms: in place of `model`: an `AuxiliarySpace`, or a function of the observation to
             one, such as `feedback` or `schur` of `cmc.theory.combinations` give.
         h: time between two steps [s].
+        integral: whether the integral is observed; without it the observation is z (n,).
         u0: command to which T_a a is added, broadcast to (n,).
         limit: bound of the declared action space; the command is clipped to the env's own.
 
@@ -53,6 +54,7 @@ class AuxiliarySpaceWrapper(gym.Wrapper[Array32, Any, Any, Any]):
         h: float,
         model: Model | None = None,
         transforms: Transforms | None = None,
+        integral: bool = True,
         u0: ArrayLike = 0.0,
         limit: float = 1.0,
     ) -> None:
@@ -68,10 +70,11 @@ class AuxiliarySpaceWrapper(gym.Wrapper[Array32, Any, Any, Any]):
             refuse_uncallable("model", model)
         self.n, self.h = env.action_space.shape[0], number("h", h, above=0.0)
         self.error, self.model, self.transforms = error, model, transforms
-        self._inner = env.action_space
+        self._inner, self._seen = env.action_space, slice(None, None, 1 if integral else 2)
         self.u0, limit = _command("u0", u0, self.n), number("limit", limit, above=0.0)
         self.action_space = spaces.Box(-limit, limit, (self.n,), np.float32)
-        self.observation_space = spaces.Box(-1e6, 1e6, (2 * self.n,), np.float32)
+        size = 2 * self.n if integral else self.n
+        self.observation_space = spaces.Box(-1e6, 1e6, (size,), np.float32)
         self.integral, self._tracker = np.zeros(self.n), Tracker()
         self.space: AuxiliarySpace | None = None
 
@@ -106,7 +109,7 @@ class AuxiliarySpaceWrapper(gym.Wrapper[Array32, Any, Any, Any]):
             self.space = found
         z = self.space.T_y @ e
         self.integral = self.integral + self.h * z  # the new value included, as everywhere
-        s = np.stack([z, self.integral], axis=-1).ravel()
+        s = np.stack([z, self.integral], axis=-1).ravel()[self._seen]
         return np.clip(s, -1e6, 1e6).astype(np.float32)
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
+import gymnasium as gym
+import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from cmc.envs.panda_task import PandaTask
 from cmc.envs.vector import Array, Array32, Mask, NativeVectorEnv, Seed, SingleEnv, Step
@@ -113,14 +117,62 @@ class PandaEnv(SingleEnv):
     - End: never terminated; truncated when the time is up.
 
     Keywords: `changes` of fields of `PandaTaskConfig`, such as `{"hold": False}` for control at
-    every physics step, and `action_mode` and `low_level` (see `PandaVectorEnv`).
+    every physics step, `render_mode` (None or "rgb_array"), and `action_mode` and `low_level` (see
+    `PandaVectorEnv`).
     """
 
-    @property
-    def task(self) -> PandaTask:
-        """The world, its layout of observations and its configuration."""
-        task: PandaTask = self.batch.task
-        return task
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
+    _renderer: mujoco.Renderer | None = None
+
+    def __init__(self, *arguments: Any, render_mode: str | None = None, **options: Any) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode: wanted None or 'rgb_array', got {render_mode!r}")
+        super().__init__(*arguments, **options)
+        self.task: PandaTask = self.batch.task
+        self.render_mode = render_mode
 
     def _stream(self, seed: int | None) -> int | None:
         return seed  # the same as the worlds' own
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The world from the scene's own point of view, (480, 640, 3); None without render mode.
+
+        Raises:
+            RuntimeError: where MuJoCo finds no graphics.
+        """
+        if self.render_mode is None:
+            gym.logger.warn("render was called without render_mode='rgb_array'")
+            return None
+        if self._renderer is None:
+            self._renderer = _renderer(self.task.worlds.model)
+        self._renderer.update_scene(self.task.worlds.data[0])
+        return np.asarray(self._renderer.render())
+
+    def close(self) -> None:
+        """Give the graphics back."""
+        if self._renderer is not None:
+            self._renderer.close()
+        self._renderer = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_renderer": None}  # graphics belong to a process
+
+
+_failures: list[str] = []
+"""Why there are no graphics: a second attempt to start them aborts the whole process."""
+
+
+def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
+    windows = sys.platform != "linux" or any(map(os.environ.get, ("DISPLAY", "MUJOCO_GL")))
+    if not windows and not _failures:
+        _failures.append("neither DISPLAY nor MUJOCO_GL is set")
+    if not _failures:
+        try:
+            return mujoco.Renderer(model, 480, 640)
+        except Exception as error:  # EGL, GLFW and OSMesa raise whatever they like
+            _failures.append(str(error))
+    raise RuntimeError(
+        f"render_mode 'rgb_array' needs graphics, and there are none: {_failures[0]}. Set "
+        "MUJOCO_GL=egl (or osmesa) before Python starts, or let cmc.view.playback.record make a "
+        "3D page of the motion"
+    )

@@ -90,7 +90,7 @@ class PandaTaskConfig:
 
 
 class PandaTask:
-    """`num` worlds of one task, without Gymnasium around them.
+    """`num` worlds of one task, without Gymnasium around them, shared by `threads`.
 
     A learner with two levels uses it like this:
 
@@ -107,17 +107,19 @@ class PandaTask:
     near, box = np.inf, (np.inf, np.inf, np.inf)
     """Success is a tip nearer to the goal than `near`, m, and within `box`, m, along each axis."""
 
-    def __init__(self, config: PandaTaskConfig, num: int = 1, seed: int | None = None) -> None:
+    def __init__(
+        self, config: PandaTaskConfig, num: int = 1, seed: int | None = None, threads: int = 1
+    ) -> None:
         if not isinstance(config, PandaTaskConfig):
             raise TypeError(f"config: wanted a PandaTaskConfig, got {config!r}")
-        self.config, self.num = config, num
+        self.config, self.num, self.threads = config, num, threads
         c, joint, steps = config, config.command == "joint", round(config.tick / config.timestep)
         self._q_start = inverse_kinematics(c.start, tool=FINGERTIP + c.peg.length)
         shared = {name: getattr(c, name) for name in ("hold", "tick", "ticks", "joint_stiffness")}
         shared |= {"joint": joint, "u_limit": np.resize(c.u_limit, JOINTS)}
         shared |= {"near": self.near, "box": self.box}
         law, scene = replace(c.law, posture=tuple(self._q_start)), self._scene(steps)
-        self.worlds = w = Worlds(scene, c.gains, law, num, steps, **shared)
+        self.worlds = w = Worlds(scene, c.gains, law, num, steps, threads, **shared)
         self.target, self.target_joints = w.target, w.target_joints
         self._goal, self._left, self._ticks = (w.rows[n] for n in ("goal", "left", "ticks"))
         self._numbers, self._flags = w.rows["numbers"], w.rows["flags"]
@@ -158,7 +160,8 @@ class PandaTask:
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies and pickles are built anew and put into the same state."""
         force = self.worlds.force.copy(), self.worlds.peaks.copy()
-        return type(self), (self.config, self.num), (self.snapshot(), force)
+        parts = (self.config, self.num, None, self.threads)
+        return type(self), parts, (self.snapshot(), force)
 
     def __setstate__(self, state: tuple[dict[str, Any], tuple[Array, Array]]) -> None:
         self.restore(state[0])

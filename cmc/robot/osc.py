@@ -22,6 +22,7 @@ itself is compiled, in `cmc.robot.tick`; `Worlds` is its face: physics seen thro
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -118,8 +119,8 @@ class Worlds:
     """`num` worlds of a scene whose contact sensors remember the physics steps of a tick.
 
     A tick lasts `substeps` physics steps; the torque is held over it, or computed at every one.
-    `law` and `more` are the fields of `cmc.robot.tick.LAW`. The arrays below are live views of the
-    worlds' records, `rows`; after a change of a target, `refresh`.
+    `threads` share the worlds. `law` and `more` are the fields of `cmc.robot.tick.LAW`. The arrays
+    below are live views of the worlds' records, `rows`; after a change of a target, `refresh`.
     """
 
     target: Array  # where the tip is to go, (N, 3), m
@@ -141,6 +142,7 @@ class Worlds:
         law: ControlLaw,
         num: int = 1,
         substeps: int = 1,
+        threads: int = 1,
         **more: Any,
     ) -> None:
         self.model, self.num = model, count("worlds", num)
@@ -158,6 +160,10 @@ class Worlds:
         for name in Worlds.__annotations__:
             setattr(self, name, self.rows[name])
         self._qpos, self._qvel = ([getattr(d, n) for d in self.data] for n in ("qpos", "qvel"))
+        threads = min(count("threads", threads), num)
+        ends = [k * num // threads for k in range(threads + 1)]
+        self._parts = [slice(*part) for part in zip(ends, ends[1:], strict=False)]
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self.quat[:] = DOWN
         self.reset(np.zeros((num, model.nq)), np.ones(num, dtype=bool))
 
@@ -191,7 +197,11 @@ class Worlds:
         if not floats or np.shape(actions) != shape:  # always `checked`: a tenth of a tick more
             actions = checked("low-level action", actions, "N size", N=num, size=size)
         values = np.array(actions, dtype=np.float64, order="C")
-        if not tick(self.rows, self._law, self._jacobians, values):
+        arrays = self.rows, self._jacobians, values
+        if self._pool is not None and np.isfinite(values).all():
+            cut = ([array[part] for array in arrays] for part in self._parts)
+            list(self._pool.map(lambda a: tick(a[0], self._law, *a[1:]), cut))
+        elif not tick(self.rows, self._law, self._jacobians, values):
             checked("low-level action", values)
 
     def push(self, force: ArrayLike) -> None:
