@@ -249,7 +249,8 @@ def test_hiro_is_compared_with_a_rigid_peg(table):
     for study in ("peg_maze", "peg_maze_stiff"):
         rows = tidy(study).query("test == 'nominal'")
         shares[study] = 100 * rows.groupby("method").below_1_N_50hz.mean()
-    assert round(shares["peg_maze_stiff"]["ctd3"], 1) == 92.2
+    assert round(shares["peg_maze_stiff"]["ctd3"], 1) == 72.7
+    assert at(tidy("peg_maze_stiff")).query("method == 'ctd3'").success.min() == 1.0
     assert round(shares["peg_maze"]["hiro"], 1) == 90.9
     assert shares["peg_maze"]["ctd3"] > 99.95
     hiro = table[table.method == "hiro"]
