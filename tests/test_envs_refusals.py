@@ -55,7 +55,7 @@ DOORS = {  # what is built or called with one bad argument; argument to bad valu
     },
     TwoLinkArm: {n: [*NONE, (0.4, -1), (1.0,)] for n in ("lengths", "masses")},
     (lambda q=G, dq=G, tau=G: ARM.acceleration(q, dq, tau)): {
-        n: [*NONE, [NAN, 0], [0.3] * 3] for n in ("q", "dq", "tau")
+        n: [None, "x", 0.3, [0.3] * 3] for n in ("q", "dq", "tau")
     },
     (lambda times=(0, 1), law=lambda *a: G: simulate(ARM, law, G, G, times)): {
         "times": [*NONE, [1, 0]],

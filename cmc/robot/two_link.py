@@ -25,8 +25,9 @@ TorqueLaw = Callable[[float, Array, Array], Array]
 class TwoLinkArm:
     """Uniform links, m and kg, under gravity along -y, m/s^2; methods take (..., 2) arrays.
 
-    The inertia of a link about its center is m l^2 / 12. Wrong shapes and what is not finite raise
-    ValueError, or TypeError, with the argument's name.
+    The inertia of a link about its center is m l^2 / 12. Wrong shapes raise ValueError, or
+    TypeError, with the argument's name; states that are not finite give NaN, as a simulation that
+    diverges needs.
     """
 
     lengths: tuple[float, float] = (0.4, 0.3)
@@ -105,7 +106,7 @@ class TwoLinkArm:
         Raises:
             ValueError: for points outside the annulus that the arm reaches.
         """
-        x, (l1, l2) = _pair("x", x), self.lengths
+        x, (l1, l2) = _pair("x", x, True), self.lengths
         cosine = (np.sum(x**2, axis=-1) - l1**2 - l2**2) / (2 * l1 * l2)
         if np.any(np.abs(cosine) > 1.0):
             raise ValueError(f"x: the tip reaches {abs(l1 - l2):g} to {l1 + l2:g} m, got {x}")
@@ -114,8 +115,8 @@ class TwoLinkArm:
         return np.stack([np.arctan2(x[..., 1], x[..., 0]) - inner, second], -1)
 
 
-def _pair(name: str, value: ArrayLike) -> Array:
-    return checked(name, value, "... 2")
+def _pair(name: str, value: ArrayLike, finite: bool = False) -> Array:
+    return checked(name, value, "... 2", finite=finite)
 
 
 def simulate(
@@ -128,7 +129,7 @@ def simulate(
     refuse_uncallable("law", law)
     times, (start, speed) = (
         increasing("times", times),
-        together(q=_pair("q", q), dq=_pair("dq", dq)),
+        together(q=_pair("q", q, True), dq=_pair("dq", dq, True)),
     )
     path = [np.stack([start, speed])]
     for t, h in zip(times, np.diff(times), strict=False):
