@@ -162,6 +162,12 @@ def test_claims_at_two_milliseconds():
     assert round(only, 1) == 0.6
 
 
+def test_a_shorter_hold_does_not_cure_shifted_plants():
+    early = tidy("peg_touch_2ms").query("method == 'cppo' and episode == 5000")
+    share = (100 * early.groupby("test").oscillation.mean()).round()
+    assert (share["lags x 0.5"], share["all, fast"]) == (40, 72)
+
+
 def test_claims_at_five_milliseconds():
     share = late_shares("peg_touch_5ms")
     cppo = share["cppo"]

@@ -235,7 +235,10 @@ def test_plain_critics_and_a_planner_by_ppo_never_touch(now):
         assert by(now, name).max() == by(now, name, "touched").max() == 0.0
         assert round(by(now, name, "return").mean()) == value
     rows = tidy("peg_push", "episodes")
-    assert round(rows[rows.method == "td3"].nearest_mm.median(), 1) == 13.6
+    nearest = rows[rows.method == "td3"].groupby("seed").nearest_mm
+    assert round(nearest.median().median(), 1) == 13.8
+    close = nearest.apply(lambda mm: (mm < 1.0).mean())
+    assert (close[0], (close > 0.05).sum()) == (0.45, 1)
     near = rows[rows.method == "ppo_control"].final_mm
     assert 1.4 < near.median() < 1.8  # on the unmoved obstacle
 
