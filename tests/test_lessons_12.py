@@ -246,3 +246,16 @@ def test_plain_critics_and_a_planner_by_ppo_never_touch(now):
 def test_the_discount_of_the_paper_halves_the_success(now):
     share = 100 * by(now, "ctd3_short")
     assert [round(x) for x in (share.mean(), share.min(), share.max())] == [49, 2, 85]
+
+
+def test_the_parts_of_the_planner(now):
+    parts = ("plain_view", "short", "no_pull", "no_bursts")
+    found = compare(now, [("ctd3", f"ctd3_{part}", "success") for part in parts])
+    assert found.p_holm.round(3).tolist() == [0.032, 0.048, 0.413, 0.881]
+    pull = 100 * found.iloc[2][["difference", "low", "high"]]
+    assert pull.round().tolist() == [27, -2, 61]
+    view, stuck = by(now, "ctd3_plain_view"), sorted(100 * by(now, "ctd3_no_pull"))[:2]
+    assert (round(100 * view.mean(), 1), [round(share) for share in stuck]) == (0.4, [12, 44])
+    final = by(now, "ctd3_plain_view", "final_mm")
+    assert (round(final.min(), 1), round(final.max(), 1)) == (0.6, 0.8)
+    assert round(100 * by(now, "ctd3_no_bursts").min()) == 99

@@ -12,8 +12,8 @@ What the paper gives is in `cmc.envs.peg_push` and in the table `tab:para`. Devi
    below a micrometer), that of its target actions is 0.05: 0.3 and 0.2 are 1.5 mm and 1 mm, coarser
    than the touch. With a probability of .1 that falls to .02 an entry of a sub-goal is drawn anew,
    and with .05 that falls to .01 three whole sub-goals in a row: only a lift with a step sideways
-   frees the target, which small noise does not find. 10,000 steps of random sub-goals come first;
-   rewards are means over a segment.
+   frees the target; Gaussian noise alone turned out to do as well (lesson 12). 10,000 steps of
+   random sub-goals come first; rewards are means over a segment.
 5. Its critics also see tip and sub-goal relative to the target in millimeters, at several scales
    (`cmc.learning.planning`), and a small weight on the actor's values before its last tanh keeps
    them where it has a slope. Critics have 128, 128 units.
