@@ -332,7 +332,7 @@ COMPARED = {
         *((rival, "return") for rival in ("frozen", "gain")),
     ],
 }
-"""C-TD3 against other arms, as in lessons 11 and 12: what each part buys, named before the tests."""
+"""C-TD3 against other arms, as in lessons 11 and 12; named before the tests."""
 
 
 # -- the page -----------------------------------------------------------------
