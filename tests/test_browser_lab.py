@@ -78,7 +78,7 @@ def views(page, selector):
         if "widget-view+json" in text or "<iframe" in text:
             page.evaluate(f"(k) => {NOTEBOOK}.content.scrollToItem(k, 'start')", k)
             cell = page.locator(f".jp-Cell[data-windowed-list-index='{k}'] .jp-OutputArea-output")
-            cell.locator(".jupyter-widgets, iframe").first.wait_for()
+            cell.locator(".jupyter-widgets, iframe, canvas").first.wait_for()
             yield from cell.locator(selector).all()
 
 

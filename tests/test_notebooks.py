@@ -174,6 +174,16 @@ def test_a_described_figure_comes_before_the_first_slider(path):
 
 
 @by_notebook
+def test_every_slider_is_shown(path):
+    """Its call ends the cell, or is displayed: in a branch or before other lines it is not seen."""
+    for cell in code(path):
+        tree = ast.parse(cell.source)
+        shown = {id(argument) for call in calls(tree, "display") for argument in call.args}
+        shown |= {id(node.value) for node in tree.body[-1:] if isinstance(node, ast.Expr)}
+        assert all(id(call) in shown for call in calls(tree, "explore")), cell.source
+
+
+@by_notebook
 def test_links_lead_to_files(path):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", prose(path)):
         if "://" not in target:
