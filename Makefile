@@ -46,7 +46,7 @@ notebooks: $(VENV)/.dev-installed
 	CMC_FAST=1 $(BIN)/python -m pytest --nbmake -n $(JOBS) --durations=0 notebooks/
 
 browser: site chromium
-	CMC_REQUIRE_BROWSER=1 CMC_ALL_LESSONS=1 CMC_SITE="$(CURDIR)/build/site" $(BIN)/python -m pytest tests/test_browser_*.py
+	CMC_REQUIRE_BROWSER=1 CMC_SITE="$(CURDIR)/build/site" $(BIN)/python -m pytest tests/test_browser_*.py
 
 chromium: $(VENV)/.dev-installed
 	@$(BIN)/python tests/find_browser.py --install
