@@ -145,7 +145,11 @@ def stays_zero(name: str, study: str = "peg_touch") -> Answer:
             "the control period is ours, 10 ms, as long as the lag tau_z: at 2 ms the policies of "
             f"episode 5,000 oscillate in {100 * fast['oscillation'].max():.1f} % of the tests"
         )
-    return Answer(text, HOLDS if data["unstable"].max() == 0.0 else FAILS, because)
+    verdict = HOLDS if data["unstable"].max() == 0.0 else FAILS
+    if study == "peg_touch_2ms" and (again := unstable(name, f"{study}_10000")["unstable"].max()):
+        because = f"another run of the same seeds, 10,000 episodes: at most {100 * again:.1f} %"
+        verdict = OPEN if verdict == HOLDS else verdict
+    return Answer(text, verdict, because)
 
 
 def smaller_errors(other: str) -> Answer:
