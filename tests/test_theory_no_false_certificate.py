@@ -57,3 +57,11 @@ def test_the_check_takes_R_where_the_command_holds_the_plant():
     assert falsehood(trial, answer, np.random.default_rng(1)) == ""
     y = Truth(trial).states(np.random.default_rng(2), 50)[:, : trial.plant.n]
     assert np.abs(trial.plant.f(y, held_still(trial.plant, y))).max() < 1e-9
+
+
+def test_rounding_of_the_check_is_not_taken_for_growth():
+    """Slopes so small that the loop contracts by 5e-12 a sample (in 50 digits): that holds."""
+    trial = draw(60623)
+    answer = trial.ask()
+    assert answer.holds
+    assert falsehood(trial, answer, np.random.default_rng(0)) == ""
