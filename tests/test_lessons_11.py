@@ -247,6 +247,8 @@ def test_a_critic_is_a_poor_teacher_at_this_length(table):
 def test_in_the_stiff_regime_a_corrected_critic_teaches_well():
     last = at(tidy("peg_maze_stiff"))
     assert last.success.min() == 1.0
+    early = at(tidy("peg_maze_stiff"), 40_000).groupby("method").success.mean()
+    assert early["td3_corrected"] == 1.0 > 0.5 > early["ctd3"]
     returns = last.groupby("method")["return"].mean().round(2)
     assert (returns["td3_corrected"], returns["ctd3"]) == (-0.68, -0.87)
     assert round(compare(last, [("ctd3", "td3_corrected", "return")]).p.iloc[0], 3) == 0.016

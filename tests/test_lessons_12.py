@@ -235,6 +235,8 @@ def test_plain_critics_and_a_planner_by_ppo_never_touch(now):
         assert by(now, name).max() == by(now, name, "touched").max() == 0.0
         assert round(by(now, name, "return").mean()) == value
     rows = tidy("peg_push", "episodes")
+    away = by(now, "ctd3_paper", "final_mm")
+    assert (round(away.min()), round(away.max())) == (65, 103)
     nearest = rows[rows.method == "td3"].groupby("seed").nearest_mm
     assert round(nearest.median().median(), 1) == 13.8
     close = nearest.apply(lambda mm: (mm < 1.0).mean())

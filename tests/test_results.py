@@ -72,6 +72,11 @@ def test_holm_by_hand_and_over_the_comparisons_named() -> None:
     found = compare(PUSH, named)
     assert list(found.index) == named
     assert list(found["p_holm"]) == pytest.approx(list(holm(found["p"])))
+    pool = np.concatenate([MAZE.loc[MAZE["method"] == name, "success"] for name in named[1][:2]])
+    rest = [2 * pool[list(c)].sum() - pool.sum() for c in itertools.combinations(range(10), 5)]
+    gap = pool[:5].sum() - pool[5:].sum()
+    wanted = 2 * min(np.mean(rest >= gap - 1e-9), np.mean(rest <= gap + 1e-9))
+    assert compare(MAZE, named).loc[named[1], "p"] == pytest.approx(wanted)  # 252 ways to deal
 
 
 def test_pooling_is_refused() -> None:

@@ -286,3 +286,12 @@ def test_what_cannot_be_drawn_is_named_and_the_rest_is_drawn(model, monkeypatch)
 def test_an_empty_picture_is_a_warning(model):
     with pytest.warns(UserWarning, match=r"nothing of groups \(5,\) is seen; geoms: \[0, 3\]"):
         tumbled(model, 2, groups=(5,))
+
+
+def test_a_page_of_20_s_with_17_moving_bodies_is_small():
+    bodies = "".join(f'<body name="b{i}"><freejoint/><geom size=".1"/></body>' for i in range(17))
+    model = load(f"<mujoco><worldbody>{bodies}</worldbody></mujoco>")
+    qpos = np.random.default_rng(0).normal(size=(1001, model.nq))
+    recording = record(model, qpos, 0.02 * np.arange(1001), trails=["b1"])
+    assert len(recording.bodies) == 17
+    assert len(recording.html().encode()) < 3e6
