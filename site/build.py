@@ -153,7 +153,7 @@ def api(folder: Path) -> str:
     rooms: dict[str, list[str]] = {}
     for name in [module.name for module in pkgutil.walk_packages(cmc.__path__, "cmc.")]:
         room, last = name.split(".")[1], name.split(".")[-1]
-        if room in ("exercises", "__main__") or last.startswith("_"):
+        if room == "__main__" or last.startswith("_"):
             continue
         # environments document themselves in Markdown: their classes are sections of their own
         space = vars(importlib.import_module(name))

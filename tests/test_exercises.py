@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.linalg import expm
 
-from cmc import exercises
+import exercises
 from cmc.theory.composite import composite
 
 

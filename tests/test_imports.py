@@ -13,7 +13,6 @@ PACKAGE = Path(__file__).resolve().parent.parent / "cmc"
 # A room may import rooms further down; `view` stands apart, and leaves are open to all.
 ORDER = [
     "__main__",
-    "exercises",
     "sb3",
     "studies",
     "results",

@@ -5,7 +5,7 @@ import pytest
 import torch
 from lesson import lesson
 
-from cmc import exercises
+import exercises
 from cmc.learning.low_level import CriticLow, Segment
 from cmc.results import at, compare, tidy
 

@@ -12,7 +12,7 @@ import nbformat
 import pytest
 from lesson import lesson
 
-from cmc import exercises
+import exercises
 
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))

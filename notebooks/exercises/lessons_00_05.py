@@ -11,9 +11,9 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import eigh, expm
 
 from cmc import plants
-from cmc.exercises import check, compare, expect, numbers
 from cmc.plants import LinearPlant
 from cmc.theory.certify import certify
+from exercises import check, compare, expect, numbers
 
 _LEANING = np.array([[-1.0, 8.0], [0.0, -1.5]])
 

@@ -1,7 +1,8 @@
 """What the exercises of the course are checked with.
 
-Checks live in `cmc/exercises/lessons_*.py` and are loaded when one of them is asked for. Most say
-what an answer is asked, what is right, and which slips deserve a hint; others what has to hold:
+They stand beside the notebooks because nobody imports them but the notebooks. Checks live in
+`lessons_*.py` and are loaded when one of them is asked for. Most say what an answer is asked, what
+is right, and which slips deserve a hint; others what has to hold:
 
     @compare("02-twice", "twice {0}")
     def twice(): ...                # yields (arguments, right[, {hint: wrong}])

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 
 from cmc.envs.peg_push import BOX_TOP, PUSH, PegPush
-from cmc.exercises import check, compare, expect, expect_close, numbers
 from cmc.plants import Plant
 from cmc.policies import ModularPolicy, PositiveNetwork
 from cmc.robot.panda import JOINTS
 from cmc.theory.certify import certify
 from cmc.theory.combinations import transforms_that_fit
 from cmc.theory.exact import Region
+from exercises import check, compare, expect, expect_close, numbers
 
 
 def _states() -> Iterator[tuple[np.ndarray, ...]]:

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from cmc.exercises import check, compare, expect, expect_close, numbers
 from cmc.plants import Peg
 from cmc.theory.identification import fit_latent
 from cmc.theory.sampled import LagLoop, sampled_matrix
+from exercises import check, compare, expect, expect_close, numbers
 
 
 def _poles(K_p: float, K_d: float, g: float, dt: float) -> np.ndarray:
