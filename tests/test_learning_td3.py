@@ -56,8 +56,29 @@ def test_a_seed_learns_the_same_alone_and_in_company() -> None:
     assert not np.allclose(state_together["actor.net.weights.0"][0], one[0, 0, 0])
 
 
-def test_resume_continues_exactly() -> None:
-    agent, replay = learner([1, 2])
+def test_an_averaged_actor_is_the_mean_of_all_that_were_and_changes_no_training() -> None:
+    agent, replay = learner([1, 2], average=0.1)
+    plain, memory = learner([1, 2])
+    first = [p.detach().numpy().copy() for p in agent.actor.parameters()]
+    past = []
+    for _ in range(20):
+        run(agent, replay, agent.config.actor_period)
+        past.append([p.detach().numpy().copy() for p in agent.actor.parameters()])
+    run(plain, memory, agent.updates)
+    age = np.arange(20)[::-1]
+    share = 0.1 * 0.9**age  # of an actor so many updates old; the first keeps the rest
+    for k, mean in enumerate(agent.acting.parameters()):
+        wanted = 0.9**20 * first[k] + sum(s * p[k] for s, p in zip(share, past, strict=True))
+        np.testing.assert_allclose(mean.detach(), wanted, atol=1e-6)
+        assert np.abs(mean.detach().numpy() - past[-1][k]).max() > 1e-4
+    for one, other in zip(agent.actor.parameters(), plain.actor.parameters(), strict=True):
+        np.testing.assert_array_equal(one.detach(), other.detach())
+    assert plain.acting is plain.actor
+
+
+@pytest.mark.parametrize("average", [0.0, 0.1])
+def test_resume_continues_exactly(average: float) -> None:
+    agent, replay = learner([1, 2], average=average)
     run(agent, replay, 7)
     saved = agent.state(), replay.state()
     run(agent, replay, 8)

@@ -31,7 +31,14 @@ MAZE, PUSHING = small(peg_maze.STUDY), small(peg_push.STUDY)
 EVERY = [(MAZE, name) for name in MAZE.methods]
 SOME = [(PUSHING, name) for name in ("ctd3", "td3_corrected", "ppo_control")]
 LEARNS = ("ctd3", "td3", "hiro")
-ADAPTED = ("ctd3_short", "ctd3_plain_view", "ctd3_no_bursts", "ctd3_no_pull", "ctd3_tuned")
+ADAPTED = (
+    "ctd3_short",
+    "ctd3_plain_view",
+    "ctd3_no_bursts",
+    "ctd3_no_pull",
+    "ctd3_tuned",
+    "ctd3_averaged",
+)
 
 
 def same_weights(one: Path, other: Path) -> None:

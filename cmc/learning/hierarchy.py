@@ -188,11 +188,11 @@ class TwoLevel(Resumable):
     def actors(self) -> dict[str, nn.Module]:
         """The networks that act: "planner" and, where it has one, "low"."""
         low = self.low.actor
-        return {"planner": self.planner.actor} | ({} if low is None else {"low": low})
+        return {"planner": self.planner.acting} | ({} if low is None else {"low": low})
 
     def acting(self) -> tuple[nn.Module, LowLevel]:
         """Planner and low level as they are now."""
-        return self.planner.actor.eval(), self.low
+        return self.planner.acting.eval(), self.low
 
     def state(self) -> State:
         """Both levels, memory, physics, random streams."""

@@ -30,7 +30,9 @@ class TD3Config:
     """Settings of one learner; defaults are the paper's `tab:para` unless marked.
 
     `pull` weighs the mean square of the actor's values before its last tanh, which keeps them where
-    tanh still has a slope.
+    tanh still has a slope. With `average` what acts after training is a running mean of the actor's
+    weights: w <- w + average (actor - w) at every actor update (Polyak and Juditsky, "Acceleration
+    of stochastic approximation by averaging", 1992).
     """
 
     actor_rate: float = 1e-4  # of Adam; the table calls it the target learning rate
@@ -47,13 +49,14 @@ class TD3Config:
     batch: int = 128  # transitions of each seed in one update
     critic_head_start: int = 0  # critic updates before the actor first moves (our choice)
     pull: float = 0.0  # our choice
+    average: float = 0.0  # our choice
 
     def __post_init__(self) -> None:
         positive = (self.actor_rate, self.critic_rate, self.target_period, self.actor_period)
         if min(*positive, self.batch) <= 0:
             raise ValueError(f"rates, periods and the batch must be positive: {self}")
-        if not (0 <= self.discount <= 1 and 0 < self.target_rate <= 1):
-            raise ValueError(f"wanted 0 <= discount <= 1 and 0 < target_rate <= 1: {self}")
+        if not (0 <= self.discount <= 1 and 0 < self.target_rate <= 1 and 0 <= self.average <= 1):
+            raise ValueError(f"wanted discount, target_rate > 0, average from 0 to 1: {self}")
 
 
 class TD3(Kept):
@@ -85,6 +88,7 @@ class TD3(Kept):
         self.critics = StackedMLP(*sizes, copies=2, seeds=own, start="signed")
         self.target_actor = copy.deepcopy(actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
+        self.acting = copy.deepcopy(self.target_actor) if config.average else actor
         adam = torch.optim.Adam
         self.actor_adam = adam(actor.parameters(), config.actor_rate, fused=True)
         self.critic_adam = adam(self.critics.parameters(), config.critic_rate, fused=True)
@@ -143,6 +147,8 @@ class TD3(Kept):
         loss.backward()
         self._clip(self.actor)
         self.actor_adam.step()
+        if config.average:
+            _move(self.acting, self.actor, config.average)
 
     def _action_gradient(self, observation: Tensor, action: Tensor) -> Tensor:
         """dQ/da of the first critic alone, (seeds, batch, action)."""
@@ -173,9 +179,10 @@ class TD3(Kept):
                 by_seed.mul_((bound / norm.clamp(min=1e-12)).clamp(max=1.0))
 
     def learners(self) -> Learners:
-        """Actor and critics, and their targets."""
+        """Actor and critics, their targets, and the mean of the actors if one is kept."""
         adam = {"actor": self.actor_adam, "critics": self.critic_adam}
-        names = ("actor", "critics", "target_actor", "target_critics")
+        names = ["actor", "critics", "target_actor", "target_critics"]
+        names += ["acting"] if self.config.average else []
         return [(dict(getattr(self, k).named_parameters(k)), adam.get(k)) for k in names]
 
 

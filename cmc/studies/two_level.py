@@ -244,6 +244,8 @@ RESTING = changed(hierarchy={"low_updates": 0})
 """The low level does not learn."""
 TUNED = changed(start_gain=20.0)
 """A gain found by hand, close to the cap: what learning should find by itself."""
+AVERAGED = changed(planner={"average": 5e-4})
+"""Over about 2,000 updates of the actor, 40,000 steps; the training itself stays the same."""
 GAUSSIAN = changed(hierarchy={"redraw": (0.0, 0.0), "burst": (0.0, 0.0)})
 
 
@@ -265,6 +267,7 @@ METHODS: dict[str, Method] = {
     "ctd3_plain_view": arm("TD3/C-TD3, plain view", latent, model, changed(relative=False)),
     "ctd3_no_bursts": arm("TD3/C-TD3, Gaussian noise alone", latent, model, GAUSSIAN),
     "ctd3_no_pull": arm("TD3/C-TD3, no pull", latent, model, changed(planner={"pull": 0.0})),
+    "ctd3_averaged": arm("TD3/C-TD3, averaged planner", latent, model, AVERAGED),
     "ctd3_paper": arm("TD3/C-TD3, the paper's scheme", critic(PositiveNetwork)),
     "ctd3_positive": arm("TD3/C-TD3, corrected critic", critic(PositiveNetwork, corrected=True)),
     "frozen": arm("TD3/frozen random C", frozen, RESTING),
