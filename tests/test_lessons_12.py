@@ -6,8 +6,11 @@ import torch
 from lesson import lesson
 
 import exercises
+from cmc import studies
+from cmc.learning.hierarchy import play
 from cmc.learning.low_level import CriticLow, Segment
 from cmc.results import at, compare, tidy
+from cmc.studies.runner import load
 
 HERE = lesson("12")
 HERE |= {"FITS": 300, "SAMPLES": 3000, "STARTS": 1, "LENGTH": 100, "TESTS": 2}
@@ -221,6 +224,20 @@ def test_lengths_and_impacts_are_said(now):
     assert round(largest["ctd3"]) == 98
     assert round(largest[["td3_corrected", "ctd3_positive"]].max()) == 120
     assert largest[["frozen", "control"]].max() < 12
+
+
+def test_the_largest_forces_are_landings_and_misses_rest_in_one_place():
+    study = studies.get("peg_push")
+    config, found = study.config_of("ctd3"), load(study, "ctd3")
+    task = config.make(5 * 4, 900_000)
+    keep = ("contact_force_max",)
+    force = play(task, config.planning(), *found.policy, 5, keep, ticks=400)[keep[0]]
+    assert force.max() > 40
+    assert np.nonzero(force > 20)[0].max() * config.task.tick < 2.5
+    each = tidy("peg_push_episodes").query("method == 'ctd3' and seed == 2 and last")
+    missed = each.final_mm[each.final_mm > 0.6]
+    assert len(missed) == 18
+    assert missed.between(0.645, 0.67).all()
 
 
 def test_from_a_slope_set_by_hand_learning_has_nothing_to_win(now):
