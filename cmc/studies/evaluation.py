@@ -18,10 +18,8 @@ from cmc.studies.runner import Folder, Progress, find, load, marks_of
 from cmc.studies.study import Rows, Study, Test, checked_methods, checked_study
 from cmc.theory.arrays import count
 
-CURVE = 100
-"""Points of a learning curve."""
-FORMAT = 3
-"""Of kept tests; raised when their figures change, so that older ones are not used."""
+CURVE = 100  # points of a learning curve
+FORMAT = 3  # of kept tests; raised when their figures change, so that older ones are not used
 Tables = dict[str, Rows]
 
 

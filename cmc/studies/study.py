@@ -9,11 +9,10 @@ from operator import index
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import nn
 
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array
+
 Rows = list[dict[str, Any]]
 Change = Callable[[Any], Any]
 """A configuration to another one."""
