@@ -63,7 +63,7 @@ def write_atomic(path: str | Path, write: Callable[[IO[bytes]], Any]) -> Path:
     own = f".{path.name}.{_HOST}-"
     for left in path.parent.glob(f"{glob.escape(own)}*.tmp"):
         pid = left.name.removeprefix(own).split("-")[0]
-        if pid.isdigit() and not alive(int(pid)):
+        if pid.isdecimal() and not (int(pid) and alive(int(pid))):
             left.unlink(missing_ok=True)
     temporary = path.with_name(f"{own}{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
@@ -82,10 +82,12 @@ def write_atomic(path: str | Path, write: Callable[[IO[bytes]], Any]) -> Path:
 
 def alive(pid: int) -> bool:
     """Whether a process of this machine is there; always true where that cannot be asked."""
+    if type(pid) is not int or pid < 1:  # 0 and less are groups of processes to the system
+        raise ValueError(f"pid: wanted the number of a process, from 1, got {pid!r}")
     if os.name == "posix":
         try:
             os.kill(pid, 0)
-        except ProcessLookupError:
+        except (ProcessLookupError, OverflowError):
             return False
         except PermissionError:
             pass

@@ -144,11 +144,13 @@ def checked_study(study: Any) -> Study:
     return study
 
 
-def checked_methods(name: str, study: Study, methods: Any) -> list[str]:
+def checked_methods(name: str, study: Study, methods: Any, least: int = 0) -> list[str]:
     """Names of a study's methods, or a ValueError."""
     if isinstance(methods, str) or not isinstance(methods, Iterable):
         raise ValueError(f"{name}: wanted a list of methods, got {methods!r}")
     found = list(methods)
+    if len(found) < least:
+        raise ValueError(f"{name}: wanted at least one method, got none")
     for method in found:
         checked_study(study).method(method)
     return found
