@@ -125,9 +125,8 @@ def read_json(path: str | Path) -> dict[str, Any]:
 
 def provenance(command: str, seeds: list[int]) -> dict[str, Any]:
     """What produced a file: the command, seeds, commit and versions."""
-    if not (
-        isinstance(command, str) and isinstance(seeds, list) and all(type(s) is int for s in seeds)
-    ):
+    named = isinstance(command, str) and isinstance(seeds, list)
+    if not named or any(type(seed) is not int for seed in seeds):
         raise ValueError(f"command, seeds: wanted text and integers, got {command!r}, {seeds!r}")
     there = [n for n in ("numpy", "scipy", "torch", "mujoco", "gymnasium") if n in sys.modules]
     versions = {"python": platform.python_version()} | {n: metadata.version(n) for n in there}

@@ -71,7 +71,9 @@ class TouchConfig:
 
 
 class TouchTraining(PPO):
-    """PPO on peg touch with the face of a study's training; it counts episodes."""
+    """PPO on peg touch with the face of a study's training, whose steps are episodes."""
+
+    steps = PPO.episodes
 
     def __init__(self, config: TouchConfig, policy: nn.Module, seeds: Sequence[int]) -> None:
         self.stride = config.episodes_per_update
@@ -80,11 +82,6 @@ class TouchTraining(PPO):
         if config.noise is not None:
             with torch.no_grad():
                 self.log_std.copy_(torch.tensor(config.noise).expand_as(self.log_std))
-
-    @property
-    def steps(self) -> int:
-        """Episodes of each seed so far."""
-        return self.episodes
 
     def segment(self) -> Array:
         """One update; mean returns (seeds,)."""
