@@ -256,9 +256,8 @@ def _page(motion: dict[str, Any], out: Path) -> None:
     shown["arrows"] = {"contact force": Arrow(motion["tip"], motion["force"])}
     shown["readouts"] = {"distance [mm]": 1e3 * motion["distance"], "force [N]": force}
     recording = record(motion["model"], motion["qpos"], motion["t"], **shown)
-    views = dict(recording.cameras)
-    near = {"task": views.pop("task")} if "task" in views else {}
-    replace(recording, cameras=near | views).save(out)
+    views = sorted(recording.cameras.items(), key=lambda view: view[0] != "task")  # the task first
+    replace(recording, cameras=dict(views)).save(out)
 
 
 if __name__ == "__main__":

@@ -8,11 +8,6 @@ from typing import TypeVar
 T = TypeVar("T")
 
 
-def fast_mode() -> bool:
-    """Whether `CMC_FAST` is set to anything but `0` or the empty string."""
-    return os.environ.get("CMC_FAST", "0") not in ("", "0")
-
-
 def budget(full: T, fast: T) -> T:
-    """Return `fast` in fast mode and `full` otherwise."""
-    return fast if fast_mode() else full
+    """Return `fast` if `CMC_FAST` is set to anything but `0` or the empty string, else `full`."""
+    return full if os.environ.get("CMC_FAST", "0") in ("", "0") else fast

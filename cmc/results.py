@@ -70,13 +70,11 @@ TABLES = {
     "tests": "a row for each method, test, kept policy and seed",
     "curves": "training: `reward` a tick or `return` of an episode by step or episode, smoothed",
     "episodes": "test episodes of the last policies: `nearest_mm`, `final_mm`",
-    "picked": "policies picked on earlier tests, one for each seed, judged on fresh starts",
     "histograms": "peg touch: `count` of trajectories of all seeds by mean force error, N",
     "certificates": "peg touch: what holds for a kept policy, from its weights",
 }
 """Tables of a study; not every study has all."""
-RESAMPLES = 9999
-"""Bootstrap samples; drawn from the same stream in every call."""
+RESAMPLES = 9999  # bootstrap samples; drawn from the same stream in every call
 
 
 def tidy(study: str, table: str = "tests") -> pd.DataFrame:

@@ -5,9 +5,8 @@
 
 is the whole change to a training with Stable-Baselines3: the (mean) action becomes `ModularPolicy`,
 with one positive network per dimension; the critic, the noise and the algorithm stay. `save` and
-`load` are Stable-Baselines3's own (a zip file that it reads with pickle: load only files that you
-trust); to keep weights without pickle, store `model.policy.state_dict()` with
-`cmc.store.save_checkpoint`.
+`load` are Stable-Baselines3's own (read with pickle: load only files that you trust); without
+pickle, `cmc.store.save_checkpoint` keeps `model.policy.state_dict()`.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from operator import attrgetter
 from typing import Any, ClassVar
 
 import numpy as np
+import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
-from torch import Tensor, nn
 
 try:
     from stable_baselines3.common.base_class import BaseAlgorithm
-    from stable_baselines3.common.policies import ActorCriticPolicy
+    from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
     from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
     from stable_baselines3.common.vec_env import VecEnv
     from stable_baselines3.td3.policies import Actor, TD3Policy
@@ -34,21 +33,10 @@ except ImportError as error:
     raise ImportError("cmc.sb3 needs Stable-Baselines3: pip install 'cmc[sb3]'") from error
 
 from cmc.policies import ConvexGradientNetwork, IndependentNetwork, ModularPolicy, PositiveNetwork
-from cmc.theory.arrays import checked, count
-
-__all__ = [
-    "BatchedVecEnv",
-    "ContractingPolicy",
-    "ContractingTD3Policy",
-    "ConvexGradientPolicy",
-    "IndependentPolicy",
-]
-Array = NDArray[np.float64]
-_FOREIGN = {"critic", "critic_target", "actor_target", "q_net", "lstm_actor", "quantile_net"}
-"""What algorithms other than PPO and its like ask their policies for."""
+from cmc.theory.arrays import Array, count
 
 
-class _Modular:
+class _Modular(BasePolicy):
     """What the policy classes share: an action that is a `ModularPolicy` on the observation.
 
     The observation is s, the flat (n, 2) array of (z_i, integral of z_i), or holds it where
@@ -61,9 +49,9 @@ class _Modular:
     _where: ClassVar[str]  # for which algorithms the class is
     _strange: ClassVar[str]  # an argument that tells another algorithm
     _hidden: ClassVar[dict[str, tuple[int, ...]]]  # layers where net_arch says nothing
+    _theirs: ClassVar[dict[str, Any]] = {}  # and those that Stable-Baselines3 builds otherwise
     _options: ClassVar[tuple[str, ...]] = ("layout", "R", "normalise", "integral")
     _action: ClassVar[Any]  # where the `ModularPolicy` is
-    action_space: Any
 
     def __init__(
         self,
@@ -80,65 +68,96 @@ class _Modular:
         if not isinstance(network_kwargs, dict | None):
             raise ValueError(f"network_kwargs: wanted a dictionary, got {network_kwargs!r}")
         self._modular = {name: kwargs.pop(name) for name in self._options if name in kwargs}
-        _check_spaces(observation_space, action_space, self._modular)
-        sizes = _layers(net_arch, self._hidden)
-        own = {"network_kwargs": dict(network_kwargs or {}), "net_arch": sizes}
-        self._asked, both = self._modular | own, (observation_space, action_space)
-        super().__init__(*both, lr_schedule, self._their_sizes(), **kwargs)  # type: ignore[call-arg]
+        for name in {"normalise", "integral"} & set(self._modular):
+            if not isinstance(self._modular[name], bool):
+                raise ValueError(f"{name}: wanted True or False, got {self._modular[name]!r}")
+        sizes, both = self._layers(net_arch), (observation_space, action_space)
+        self._asked = {**self._modular, "network_kwargs": network_kwargs or {}, "net_arch": sizes}
+        super().__init__(*both, lr_schedule, sizes | self._theirs, **kwargs)  # type: ignore[call-arg]
 
-    def _their_sizes(self) -> Any:
-        """Hidden layers as the class of Stable-Baselines3 builds them."""
-        return self._asked["net_arch"]
+    def _layers(self, asked: Any) -> dict[str, list[int]]:
+        """Hidden layers by key; as in Stable-Baselines3, a dictionary without a key means none."""
+        given = self._hidden if asked is None else asked
+        given = given if isinstance(given, dict) else dict.fromkeys(self._hidden, given)
+        lists = all(isinstance(layers, list | tuple) for layers in given.values())
+        if not lists or not set(given) <= set(self._hidden):
+            raise ValueError(f"net_arch: wanted sizes for {', '.join(self._hidden)}, got {asked!r}")
+        return {key: [count("net_arch", n) for n in given.get(key, ())] for key in self._hidden}
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self._asked}  # type: ignore[misc]
 
-    def jacobian(self, s: Tensor) -> Tensor:
+    def _policy(self, kind: Any, **options: Any) -> ModularPolicy:
+        """The action by networks of a kind, where spaces and layout hold what they need."""
+        seen, action = self.observation_space, self.action_space
+        if not isinstance(action, spaces.Box) or len(action.shape) != 1:
+            raise ValueError(f"wanted actions in a Box of one axis; got {action}")
+        n, shape = action.shape[0], tuple(seen.shape or ())
+        laid_out = self._modular.get("layout") is not None
+        if not isinstance(seen, spaces.Box) or (len(shape) != 1 if laid_out else shape != (2 * n,)):
+            raise ValueError(
+                f"wanted observations of shape ({2 * n},), (z_i, integral of z_i) for each of "
+                f"{n} actions, or a layout; got {shape or seen}"
+            )
+        hidden, kwargs = self._asked["net_arch"]["pi"], self._asked["network_kwargs"]
+        hidden = (hidden or [0])[0] if kind is ConvexGradientNetwork else hidden
+        policy = ModularPolicy(kind(n, hidden=hidden, **kwargs), **self._modular, **options)
+        wanted = {"s": 2 * n, "z": n, "integral": n, "R": n, "T_a": n * n}
+        for name, part in policy.layout.items():
+            if len(range(*part.indices(*shape))) != wanted[name] or (part.stop or 0) > shape[0]:
+                raise ValueError(
+                    f"layout: {name!r} needs {wanted[name]} numbers for {n} actions, got {part} of "
+                    f"an observation of shape {shape}"
+                )
+        return policy
+
+    def jacobian(self, s: torch.Tensor) -> torch.Tensor:
         """Slopes of the network, before sign rule and any tanh: s (..., n, 2) to (..., n, 2)."""
         return self._action(self).jacobian(s)
+
+    def slope_bounds(self) -> tuple[Array, Array]:
+        """Interval of the slopes' magnitude in the action by the plain s, (n, 2) each."""
+        return self.on_signals().slope_bounds()  # type: ignore[operator]
+
+    def _normalisation(self) -> Any:
+        """VecNormalize of the algorithm that holds this, if it scales observations; else None."""
+        holders = gc.get_referrers(self)
+        for part in [part for part in holders if isinstance(part, dict)]:  # attributes of something
+            holders += [x for x in gc.get_referrers(part) if getattr(x, "__dict__", None) is part]
+        found = [x.get_vec_normalize_env() for x in holders if isinstance(x, BaseAlgorithm)]
+        return next((env for env in found if env is not None and env.norm_obs), None)
 
 
 class _ActorCritic(_Modular, ActorCriticPolicy):
     """Gaussian policy whose mean is a `ModularPolicy`; takes its `u0`, the center, as well."""
 
-    _where = (
-        "is for PPO, A2C and their like, which ask a policy for a Gaussian action and a value; "
-        "for TD3 and DDPG there is ContractingTD3Policy"
-    )
+    _where = "is for PPO, A2C and their like; for TD3 and DDPG there is ContractingTD3Policy"
     _strange, _action = "n_critics", attrgetter("action_net")
     _options = (*_Modular._options, "u0")
     _hidden: ClassVar = {"pi": (32, 32), "vf": (64, 64)}
+    _theirs: ClassVar = {"pi": []}  # the mean sees the observation
     network: ClassVar[Any]
-
-    def _their_sizes(self) -> Any:
-        return {"pi": [], "vf": self._asked["net_arch"]["vf"]}  # the mean sees the observation
+    # what other algorithms ask their policies for
+    _foreign = ("critic", "critic_target", "actor_target", "q_net", "lstm_actor", "quantile_net")
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
-        hidden, kwargs = self._asked["net_arch"]["pi"], self._asked["network_kwargs"]
-        hidden = hidden[0] if self.network is ConvexGradientNetwork else hidden
-        network = self.network(self.action_space.shape[0], hidden=hidden, **kwargs)
-        self.action_net = ModularPolicy(network, **self._modular)
+        self.action_net = self._policy(self.network)
         options: Any = {"lr": lr_schedule(1), **self.optimizer_kwargs}
         self.optimizer = self.optimizer_class(self.parameters(), **options)  # a module is new
 
     @property
     def actor(self) -> ModularPolicy:
         """The mean as a policy of this package."""
-        assert isinstance(self.action_net, ModularPolicy)
-        return self.action_net
+        return self.action_net  # type: ignore[return-value]
 
     def on_signals(self) -> Any:
         """The mean as a function of the plain s: behind the algorithm's VecNormalize, if any."""
-        found = _normalisation(self)
+        found = self._normalisation()
         return self.actor if found is None else _OnSignals(self.actor, found)
 
-    def slope_bounds(self) -> tuple[Array, Array]:
-        """Guaranteed interval of the slopes' magnitude, (n, 2) each."""
-        return self.actor.slope_bounds()
-
     def __getattr__(self, name: str) -> Any:
-        if name in _FOREIGN:
+        if name in self._foreign:
             raise AttributeError(f"{type(self).__name__} {self._where}: it has no {name!r}")
         return super().__getattr__(name)
 
@@ -168,76 +187,19 @@ class ContractingTD3Policy(_Modular, TD3Policy):
     have the right sign and a cap but no floor: `certify` answers in a region.
     """
 
-    _where = (
-        "is for TD3 and DDPG, whose actions have no distribution of their own; for PPO and A2C "
-        "there is ContractingPolicy"
-    )
+    _where = "is for TD3 and DDPG; for PPO and A2C there is ContractingPolicy"
     _strange, _action = "use_sde", attrgetter("actor.mu")
     _hidden: ClassVar = {"pi": (32, 32), "qf": (256, 256)}
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         """Build the actor, or its slow copy."""
         actor = super().make_actor(features_extractor)
-        hidden, kwargs = self._asked["net_arch"]["pi"], self._asked["network_kwargs"]
-        network = PositiveNetwork(self.action_space.shape[0], hidden=hidden, **kwargs)
-        actor.mu = ModularPolicy(network, squash=True, **self._modular)  # type: ignore[assignment]
+        actor.mu = self._policy(PositiveNetwork, squash=True)  # type: ignore[assignment]
         return actor.to(self.device)
 
     def on_signals(self) -> _OnSignals:
         """The actor as a function of the plain s, scaled to the action space."""
-        return _OnSignals(self._action(self), _normalisation(self), self.action_space)
-
-    def slope_bounds(self) -> tuple[Array, Array]:
-        """Interval of the slopes' magnitude in the scaled action, (n, 2) each, from 0."""
-        return self.on_signals().slope_bounds()
-
-
-def _layers(net_arch: Any, usual: dict[str, tuple[int, ...]]) -> dict[str, list[int]]:
-    """Hidden layers by key; as in Stable-Baselines3, a key left out of a dictionary means none."""
-    given = usual if net_arch is None else net_arch
-    given = given if isinstance(given, dict) else dict.fromkeys(usual, given)
-    lists = all(isinstance(layers, list | tuple) for layers in given.values())
-    if not lists or not set(given) <= set(usual):
-        raise ValueError(f"net_arch: wanted sizes for {', '.join(usual)}, got {net_arch!r}")
-    return {name: [count("net_arch", n) for n in given.get(name, ())] for name in usual}
-
-
-def _check_spaces(seen: Any, action: Any, options: dict[str, Any]) -> None:
-    """Refuse spaces that hold no (n, 2) signals for n actions, or options that do not fit."""
-    if not isinstance(action, spaces.Box) or len(action.shape) != 1:
-        raise ValueError(f"wanted actions in a Box of one axis; got {action}")
-    layout, n = options.get("layout"), action.shape[0]
-    shape: tuple[int, ...] = getattr(seen, "shape", None) or ()
-    if not isinstance(seen, spaces.Box) or (layout is None and shape != (2 * n,)):
-        raise ValueError(
-            f"wanted observations of shape ({2 * n},), (z_i, integral of z_i) for each of "
-            f"{n} actions, or a layout; got {shape or seen}"
-        )
-    checked("R", options.get("R", 1.0))
-    for name in {"normalise", "integral"} & set(options):
-        if not isinstance(options[name], bool):
-            raise ValueError(f"{name}: wanted True or False, got {options[name]!r}")
-    parts = {} if layout is None else layout
-    if not isinstance(parts, dict) or not all(isinstance(p, slice) for p in parts.values()):
-        raise ValueError(f"layout: wanted slices by name, got {layout!r}")
-    wanted = {"s": 2 * n, "R": n, "T_a": n * n}
-    for name, part in parts.items():
-        inside = range(*part.indices(shape[0])) if len(shape) == 1 else range(0)
-        if name in wanted and (len(inside) != wanted[name] or (part.stop or 0) > shape[0]):
-            raise ValueError(
-                f"layout: {name!r} needs {wanted[name]} numbers for {n} actions, got {part} of an "
-                f"observation of shape {shape}"
-            )
-
-
-def _normalisation(policy: nn.Module) -> Any:
-    """VecNormalize of the algorithm that holds a policy, if it scales observations; else None."""
-    holders = gc.get_referrers(policy)
-    for part in [part for part in holders if isinstance(part, dict)]:  # attributes of something
-        holders += [x for x in gc.get_referrers(part) if getattr(x, "__dict__", None) is part]
-    algorithms = [holder for holder in holders if isinstance(holder, BaseAlgorithm)]
-    found = [algorithm.get_vec_normalize_env() for algorithm in algorithms]
-    return next((env for env in found if env is not None and env.norm_obs), None)
+        return _OnSignals(self._action(self), self._normalisation(), self.action_space)
 
 
 class _OnSignals:
@@ -248,30 +210,25 @@ class _OnSignals:
     (`box`): w is half its width, its middle joins `u0`.
     """
 
-    def __init__(
-        self, policy: ModularPolicy, scales: Any = None, box: spaces.Box | None = None
-    ) -> None:
+    def __init__(self, policy: ModularPolicy, scales: Any, box: Any = None) -> None:
         if scales is not None and set(policy.layout) != {"s"}:
             raise ValueError("VecNormalize scales T_a and R as well: the policy sees wrong ones")
         policy = copy.deepcopy(policy).cpu()
-        self.n, self.layout, self.normalise = policy.n, policy.layout, policy.normalise
-        self.integral, self.squash, self.R = policy.integral, policy.squash, policy.R.numpy()
+        self.layout, self.normalise, self.R = policy.layout, policy.normalise, policy.R.numpy()
+        self.squash, self.integral = policy.squash, policy.integral
         low, high = (-1.0, 1.0) if box is None else (box.low.astype(float), box.high.astype(float))
         self.half, self.u0 = (high - low) / 2, (high + low) / 2 + policy.u0.numpy()
-        self.mean, self.std, self.clip = 0.0, np.ones((self.n, 2)), np.inf
+        self.mean, self.std, self.clip = 0.0, np.ones((policy.n, 2)), np.inf
         if scales is not None:
-            part, shape = policy.layout["s"], (self.n, 2)
-            self.mean = scales.obs_rms.mean[part].reshape(shape)
-            self.std = np.sqrt(scales.obs_rms.var[part] + scales.epsilon).reshape(shape)
+            seen = (scales.obs_rms.mean, np.sqrt(scales.obs_rms.var + scales.epsilon))
+            self.mean, self.std = (x[policy.layout["s"]].reshape(policy.n, 2) for x in seen)
             self.clip = float(scales.clip_obs)
         self.bounds, self.network = policy.slope_bounds(), policy.network.double()
 
     def pi(self, s: Array) -> Array:
         """The action before the sign rule, on the plain signals, (..., n, 2) to (..., n)."""
         seen = np.clip((s - self.mean) / self.std, -self.clip, self.clip)
-        seen = seen * [1.0, float(self.integral)]
-        like = next(self.network.parameters())
-        value = self.network(like.new_tensor(seen)).detach().numpy()
+        value = self.network(torch.from_numpy(seen * [1.0, float(self.integral)])).detach().numpy()
         return np.asarray(self.half * (np.tanh(value) if self.squash else value))
 
     def slope_bounds(self) -> tuple[Array, Array]:
@@ -292,7 +249,6 @@ class BatchedVecEnv(VecEnv):
             raise ValueError(f"env: wanted a restart in the same step, {wanted}; got {mode}")
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-        self._actions: Any = None
         self._return, self._length = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=int)
 
     def reset(self) -> Any:

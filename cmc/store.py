@@ -63,7 +63,7 @@ def write_atomic(path: str | Path, write: Callable[[IO[bytes]], Any]) -> Path:
     own = f".{path.name}.{_HOST}-"
     for left in path.parent.glob(f"{glob.escape(own)}*.tmp"):
         pid = left.name.removeprefix(own).split("-")[0]
-        if pid.isdigit() and not alive(int(pid)):
+        if pid.isdecimal() and not (int(pid) and alive(int(pid))):
             left.unlink(missing_ok=True)
     temporary = path.with_name(f"{own}{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
@@ -82,10 +82,12 @@ def write_atomic(path: str | Path, write: Callable[[IO[bytes]], Any]) -> Path:
 
 def alive(pid: int) -> bool:
     """Whether a process of this machine is there; always true where that cannot be asked."""
+    if type(pid) is not int or pid < 1:  # 0 and less are groups of processes to the system
+        raise ValueError(f"pid: wanted the number of a process, from 1, got {pid!r}")
     if os.name == "posix":
         try:
             os.kill(pid, 0)
-        except ProcessLookupError:
+        except (ProcessLookupError, OverflowError):
             return False
         except PermissionError:
             pass
@@ -123,9 +125,8 @@ def read_json(path: str | Path) -> dict[str, Any]:
 
 def provenance(command: str, seeds: list[int]) -> dict[str, Any]:
     """What produced a file: the command, seeds, commit and versions."""
-    if not (
-        isinstance(command, str) and isinstance(seeds, list) and all(type(s) is int for s in seeds)
-    ):
+    named = isinstance(command, str) and isinstance(seeds, list)
+    if not named or any(type(seed) is not int for seed in seeds):
         raise ValueError(f"command, seeds: wanted text and integers, got {command!r}, {seeds!r}")
     there = [n for n in ("numpy", "scipy", "torch", "mujoco", "gymnasium") if n in sys.modules]
     versions = {"python": platform.python_version()} | {n: metadata.version(n) for n in there}

@@ -158,5 +158,5 @@ def test_every_seed_has_its_own_starts() -> None:
     again, _ = env.reset(seed=[8, 3])
     np.testing.assert_array_equal(both[:2], again[2:])
     assert not np.allclose(both[:2], both[2:])
-    with pytest.raises(ValueError, match="divide 4 worlds"):
+    with pytest.raises(ValueError, match=r"divides 4, got \[1, 2, 3\]"):
         env.reset(seed=[1, 2, 3])

@@ -19,7 +19,6 @@ from cmc.learning.hiro import (
     PullActor,
     candidates,
     log_likelihood,
-    subgoal_transition,
 )
 from cmc.learning.low_level import Segment, rollout
 from cmc.learning.td3 import TD3, Batch, TD3Config
@@ -47,7 +46,7 @@ def segment_of(goal: Tensor, gain: float = 0.5, start: Tensor | None = None):
     for _ in range(T):
         actions.append(gain * left)
         following = state + 0.3 * actions[-1]
-        left = subgoal_transition(left, state, following)
+        left = state + left - following
         state = following
         states.append(state)
     return torch.stack(states, -2), torch.stack(actions, -2)
@@ -55,14 +54,6 @@ def segment_of(goal: Tensor, gain: float = 0.5, start: Tensor | None = None):
 
 def drawn(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
-
-
-def test_a_sub_goal_keeps_its_target_while_the_joints_move() -> None:
-    states, goal = drawn(7, 4, N), drawn(4, N, seed=1)
-    left = goal
-    for now, following in zip(states, states[1:], strict=False):
-        left = subgoal_transition(left, now, following)
-    torch.testing.assert_close(states[-1] + left, states[0] + goal)
 
 
 def test_candidates_are_the_original_the_motion_and_draws_around_it() -> None:

@@ -269,6 +269,15 @@ def test_bad_hyperparameters(options, match):
         PPOConfig(**options)
 
 
+def test_minibatches_of_one_step_whose_advantage_has_no_spread_are_refused():
+    few = training(config=PPOConfig(steps=1, minibatches=3, critic_hidden=(8,)))
+    with pytest.raises(ValueError, match="2 steps for each of 3 minibatches, got 4"):
+        few.train(1)
+    enough = training(config=PPOConfig(steps=1, minibatches=2, critic_hidden=(8,)))
+    enough.train(1)
+    assert all(weight.isfinite().all() for weight in enough.parameters.values())
+
+
 def test_bad_seeds():
     env = PegTouchVectorEnv(num_envs=5)
     policy = ModularPolicy(PositiveNetwork(2, seeds=[0, 1]))

@@ -37,7 +37,6 @@ from cmc.theory.certify import certify
 from cmc.theory.exact import Region
 from cmc.theory.slopes import action_of
 
-PEG = "cmc.envs:cmc/PegTouch-v0"
 UPDATES, CONFIG = 40, PPOConfig(critic_hidden=(32, 32))
 KWARGS = {"log_std_init": CONFIG.log_std_start, "net_arch": {"pi": [16, 16], "vf": [32, 32]}}
 ALIKE = {"n_steps": 50, "batch_size": 200, "n_epochs": 4, "learning_rate": CONFIG.learning_rate}
@@ -205,7 +204,8 @@ def test_edges_of_other_algorithms_spaces_and_layouts():
     rate, pendulum = lambda _: 1e-3, gymnasium.make("Pendulum-v1")
     action, seen, own = spaces.Box(-1, 1, (2,)), spaces.Box(-1, 1, (5,)), spaces.Box(-1, 1, (4,))
     gaussian, there = "for PPO, A2C and their like", "for TD3 and DDPG.*there is ContractingPolicy"
-    sync = gymnasium.make_vec(PEG, num_envs=2, vectorization_mode="sync")
+    sync = gymnasium.make_vec("cmc.envs:cmc/PegTouch-v0", num_envs=2, vectorization_mode="sync")
+    peg, no_layers = PegTouchEnv(), {"net_arch": {"pi": []}}
     wide = {"layout": {"s": slice(0, 9)}}
     for call, message in (
         (lambda: ContractingPolicy(seen, action, rate), r"shape \(4,\)"),
@@ -214,20 +214,28 @@ def test_edges_of_other_algorithms_spaces_and_layouts():
         (lambda: ContractingPolicy(own, action, rate, net_arch={"qf": [3]}), "net_arch: wanted"),
         (lambda: ContractingPolicy(own, action, rate, R=np.nan), "R needs finite"),
         (lambda: ContractingPolicy(own, action, rate, integral=3), "integral: wanted True"),
-        (lambda: SB3PPO(ContractingPolicy, PEG, policy_kwargs=wide), "layout: 's' needs 4 numbers"),
-        (lambda: TD3(ContractingPolicy, PEG, buffer_size=9), "there is ContractingTD3Policy"),
+        (lambda: SB3PPO(ContractingPolicy, peg, policy_kwargs=wide), "layout: 's' needs 4 numbers"),
+        (lambda: ContractingPolicy(seen, action, rate, layout=[3]), "layout needs a mapping"),
+        (
+            lambda: ContractingPolicy(
+                seen, action, rate, layout={"z": slice(2), "integral": slice(2, 5)}
+            ),
+            "layout: 'integral' needs 2 numbers for 2 actions, got slice",
+        ),
+        (lambda: SB3PPO(ConvexGradientPolicy, peg, policy_kwargs=no_layers), "hidden needs"),
+        (lambda: TD3(ContractingPolicy, peg, buffer_size=9), "there is ContractingTD3Policy"),
         (
             lambda: TD3(ContractingTD3Policy, pendulum, buffer_size=9),
             r"of shape \(2,\).*got \(3,\)",
         ),
         (lambda: BatchedVecEnv(sync), "env: wanted a restart in the same step"),
-        *((lambda a=a: a(ContractingPolicy, PEG, buffer_size=9), gaussian) for a in (SAC, DDPG)),
-        *((lambda a=a: a(ContractingTD3Policy, PEG), there) for a in (SB3PPO, SAC)),
+        *((lambda a=a: a(ContractingPolicy, peg, buffer_size=9), gaussian) for a in (SAC, DDPG)),
+        *((lambda a=a: a(ContractingTD3Policy, peg), there) for a in (SB3PPO, SAC)),
     ):
         with pytest.raises((ValueError, TypeError, AttributeError), match=message):
             call()
     assert ContractingPolicy(seen, action, rate, layout={"s": slice(1, 5)}).actor.n == 2
-    model = SB3PPO(ContractingPolicy, PEG, policy_kwargs={"net_arch": {"pi": [16]}}, n_steps=64)
+    model = SB3PPO(ContractingPolicy, peg, policy_kwargs={"net_arch": {"pi": [16]}}, n_steps=64)
     assert model.policy.net_arch["vf"] == []
 
 

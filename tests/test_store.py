@@ -149,3 +149,19 @@ def test_provenance_names_command_seeds_and_versions() -> None:
 def test_an_unknown_asset_is_named() -> None:
     with pytest.raises(FileNotFoundError, match="no asset 'results/nothing.json'"):
         store.asset("results", "nothing.json")
+
+
+def test_only_a_process_is_asked_whether_it_is_alive(tmp_path: Path) -> None:
+    assert store.alive(os.getpid())
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    assert not store.alive(ended.pid)
+    assert not store.alive(10**30)  # more than the system can count
+    for bad in (0, -1, True, 2.0, "1", None):
+        with pytest.raises(ValueError, match="pid: wanted the number of a process"):
+            store.alive(bad)  # type: ignore[arg-type]
+    own = f".a.json.{store._HOST}-"
+    for pid in ("0", "9" * 30):  # no process: what it left is removed
+        (tmp_path / f"{own}{pid}-x.tmp").touch()
+    path = store.write_json(tmp_path / "a.json", {})
+    assert list(tmp_path.iterdir()) == [path]

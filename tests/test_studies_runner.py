@@ -20,6 +20,7 @@ from torch import nn
 
 from cmc import results, store, studies
 from cmc.studies.evaluation import evaluate, ship, summary
+from cmc.studies.live import live_policies
 from cmc.studies.runner import load, marks_of, train
 from cmc.studies.study import Method, Study, Test, before_last, last
 from cmc.studies.sweep import merge, sweep
@@ -187,6 +188,8 @@ def test_wrong_requests_are_named(whole: Path, tmp_path: Path) -> None:
         (lambda: evaluate(TOY, ["still"], trajectories=0), "trajectories needs"),
         (lambda: studies.get("toy"), "unknown study 'toy'; wanted one of peg_touch"),
         (lambda: sweep("peg_touch", ["cppo"], [0], jobs=0), "jobs needs"),
+        (lambda: sweep("peg_touch", [], [0]), "names: wanted at least one method, got none"),
+        (lambda: live_policies(studies.get("peg_maze"), []), "methods: wanted at least one method"),
         (lambda: sweep("peg_touch", ["cppo"], [0], backend="mpi"), "wanted 'loky' or 'dask'"),
     ):
         with pytest.raises(ValueError, match=message):

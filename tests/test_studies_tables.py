@@ -111,6 +111,19 @@ def test_a_short_table_has_every_method_and_seed():
     assert mean["nominal gain"] == mean["searched gain"]
 
 
+@pytest.mark.parametrize(
+    ("settings", "seeds", "message"),
+    [
+        ((), [0], "settings: wanted some of as designed"),
+        (("heavy",), [0], "settings: wanted some of .* got \\('heavy',\\)"),
+        (("as designed",), [], "seeds: wanted at least one"),
+    ],
+)
+def test_a_table_of_nothing_is_refused(settings, seeds, message):
+    with pytest.raises(ValueError, match=message):
+        table(settings, seeds)
+
+
 def test_a_table_is_computed_by_one_command(tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(softness, "CONFIGS", {"soft": SOFT})
     monkeypatch.setattr(softness, "wander", lambda *_: {})

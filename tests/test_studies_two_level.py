@@ -25,7 +25,7 @@ from cmc.studies.peg_push import TIME_CONSTANT, scaled
 from cmc.studies.runner import load, marks_of, train
 from cmc.studies.study import Test
 from cmc.studies.two_level import TwoLevelConfig
-from cmc.studies.two_level_tests import consistency, figures, judge, motion, slope_at_rest
+from cmc.studies.two_level_tests import consistency, figures, judge, motion
 
 MAZE, PUSHING = small(peg_maze.STUDY), small(peg_push.STUDY)
 EVERY = [(MAZE, name) for name in MAZE.methods]
@@ -115,7 +115,7 @@ def test_bad_requests_are_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="unknown method 'hiro'"):
         train(PUSHING, "hiro", [0], out=tmp_path)
     few = MAZE.variant("peg_maze", "", ppo=replace(MAZE.config.ppo, minibatches=9))
-    with pytest.raises(ValueError, match="two segments for each of 9 minibatches, got 6"):
+    with pytest.raises(ValueError, match="2 steps for each of 9 minibatches, got 6"):
         train(few, "ppo_control", [0], out=tmp_path)
     path = train(MAZE, "frozen", [0], length=120, out=tmp_path)
     with pytest.raises(store.CheckpointError, match="study 'peg_push'"):
@@ -183,16 +183,14 @@ def test_an_episode_that_touches_and_leaves_has_passed_by() -> None:
     assert (row["below_1_N_50hz"], row["largest_N_50hz"], row["largest_N"]) == (0.5, 7.0, 14.0)
 
 
-def test_slopes_are_zero_without_a_low_level_and_refused_in_joint_space() -> None:
+def test_the_slope_at_rest_is_the_gain_that_was_set() -> None:
     config: TwoLevelConfig = PUSHING.config
-    control = PUSHING.build("control", [0, 1]).acting()[1]
-    assert not slope_at_rest(config, control, 2).any()
-    gain = PUSHING.build("gain", [0]).acting()[1]
-    np.testing.assert_allclose(
-        slope_at_rest(config, gain, 1)[0], np.minimum(20.0, 0.99 * config.slope_cap()), rtol=1e-3
-    )
-    with pytest.raises(ValueError, match="wanted a low level of the tip"):
-        slope_at_rest(MAZE.config_of("hiro"), gain, 1)
+    (row,) = judge(config, PUSHING.build("gain", [0]).acting(), 1, Test("nominal", 1))["tests"]
+    slopes = [row[f"slope_{axis}"] for axis in ("x", "y", "z", "rx", "ry", "rz")]
+    np.testing.assert_allclose(slopes, np.minimum(20.0, 0.99 * config.slope_cap()), rtol=1e-3)
+    assert "cap_x" not in row  # nothing but the hand keeps it there
+    (row,) = judge(config, PUSHING.build("control", [0]).acting(), 1, Test("nominal", 1))["tests"]
+    assert "slope_x" not in row
 
 
 # -- how consistent a low level is, over starts and pushes -----------------------------------------

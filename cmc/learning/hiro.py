@@ -20,17 +20,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from cmc.learning.low_level import CriticLow, Segment, tensor
 from cmc.learning.state import Kept
 from cmc.learning.td3 import TD3, Batch
 from cmc.policies import StackedMLP, tanh
+from cmc.theory.arrays import Array
 
-Array = NDArray[np.float64]
-CANDIDATES = 10
-"""The sub-goal as it was, the motion that followed, and eight drawn around that motion."""
+CANDIDATES = 10  # the sub-goal as it was, the motion that followed, and eight drawn around it
 
 
 @dataclass(frozen=True)
@@ -46,14 +44,8 @@ class JointUnits:
     def normalise(self, observation: Array) -> Array:
         """(..., 3n) in rad and rad/s to the units of this module."""
         q, v, e = np.split(observation, 3, axis=-1)
-        return np.concatenate(
-            [(q - self.start) / self.half, v / self.speed, e / self.half], axis=-1
-        )
-
-
-def subgoal_transition(goal: Tensor, state: Tensor, following: Tensor) -> Tensor:
-    """What is left of a sub-goal: g' = s + g - s'."""
-    return state + goal - following
+        parts = [(q - self.start) / self.half, v / self.speed, e / self.half]
+        return np.concatenate(parts, axis=-1)
 
 
 def candidates(goal: Tensor, moved: Tensor, noise: Tensor) -> Tensor:
@@ -86,7 +78,7 @@ def log_likelihood(
     """
     start = states[..., None, :1, :]  # (seeds, batch, 1, 1, n)
     first = (start + goals[..., None, :]).clamp(*reach) - start
-    left = subgoal_transition(first, start, states[..., None, :, :])  # (seeds, batch, k, T, n)
+    left = start + first - states[..., None, :, :]  # (seeds, batch, k, T, n)
     seen = [part[..., None, :, :].expand_as(left) for part in (states, speeds)]
     inputs = torch.cat([*seen, left], dim=-1).flatten(1, -2)
     predicted = actor(inputs).view(left.shape)
@@ -149,8 +141,8 @@ class OffPolicyCorrection(Kept):
         units = low.units
         self.n = len(units.start)
         self.size = (3 * horizon + 1) * self.n
-        ends = [(end - units.start) / units.half for end in (units.low, units.high)]
-        self._reach = (tensor(ends[0]), tensor(ends[1]))
+        least, most = ((end - units.start) / units.half for end in (units.low, units.high))
+        self._reach = (tensor(least), tensor(most))
         self.streams = [np.random.default_rng([seed, 4, 17]) for seed in seeds]
 
     def pack(self, segment: Segment) -> Array:
@@ -163,12 +155,6 @@ class OffPolicyCorrection(Kept):
 
     def relabel(self, batch: Batch) -> Batch:
         """The sample with each sub-goal replaced by its likeliest candidate."""
-        goals, score = self.scored(batch)
-        best = score.argmax(-1)[..., None, None].expand(-1, -1, 1, self.n)
-        return replace(batch, action=goals.gather(2, best)[:, :, 0])
-
-    def scored(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Candidates (seeds, batch, 10, n) for a sample, and their log-likelihoods."""
         rows = batch.extra[..., : -self.n].unflatten(-1, (self.horizon, 3 * self.n))
         moved = batch.extra[..., -self.n :] - rows[..., 0, : self.n]
         shape = (moved.shape[1], CANDIDATES - 2, self.n)
@@ -176,4 +162,6 @@ class OffPolicyCorrection(Kept):
         goals = candidates(batch.action, moved, torch.from_numpy(noise))
         states, speeds, actions = rows[..., :: self.stride, :].chunk(3, dim=-1)
         actor = self.low.agent.actor
-        return goals, log_likelihood(actor, states, speeds, actions, goals, self._reach)
+        score = log_likelihood(actor, states, speeds, actions, goals, self._reach)
+        best = score.argmax(-1)[..., None, None].expand(-1, -1, 1, self.n)
+        return replace(batch, action=goals.gather(2, best)[:, :, 0])

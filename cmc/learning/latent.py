@@ -17,14 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.linalg import expm
 from torch import Tensor, nn
 
 from cmc.learning.low_level import LowLevel, Segment, tensor
 from cmc.learning.state import Learners
-
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -13,17 +13,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from cmc.envs.panda_task import CRITIC, PandaTask
 from cmc.learning.state import Kept, Learners
 from cmc.learning.td3 import TD3, Replay
 from cmc.policies import IndependentNetwork, ModularPolicy, PositiveNetwork, as_numpy
+from cmc.theory.arrays import Array
 
-Array = NDArray[np.float64]
-CAPACITY = 65536
-"""Ticks that a critic's memory keeps for each seed."""
+CAPACITY = 65536  # ticks that a critic's memory keeps for each seed
 
 
 @dataclass(frozen=True)

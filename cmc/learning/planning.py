@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,9 +15,9 @@ from torch import Tensor, nn
 
 from cmc.envs.panda_task import PandaTask
 from cmc.learning.low_level import LowLevel, rollout, tensor
-from cmc.learning.ppo import PPO, PPOConfig
+from cmc.learning.ppo import PPO
+from cmc.theory.arrays import Array
 
-Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 
@@ -119,11 +119,8 @@ class SegmentEnv(VectorEnv[Array32, Array32, NDArray[Any]]):
         """Start all episodes anew; `seed` is one integer for each equal group of worlds."""
         if seed is not None:
             seeds = np.atleast_1d(seed)
-            each, rest = divmod(self.num_envs, len(seeds))
-            if rest:
-                wanted = f"seed: wanted integers that divide {self.num_envs} worlds equally"
-                raise ValueError(f"{wanted}, got {len(seeds)}")
-            self.task.seed([int(s) + k for s in seeds for k in range(each)])
+            each = range(self.num_envs // max(len(seeds), 1))
+            self.task.seed([int(s) + k for s in seeds for k in each])
         return self._seen(self.task.reset()), {}
 
     def step(self, actions: Array32) -> tuple[Array32, Any, Any, Any, dict[str, Any]]:
@@ -145,12 +142,6 @@ class OneLevelPPO(PPO):
 
     env: SegmentEnv
 
-    def __init__(
-        self, env: SegmentEnv, actor: nn.Module, seeds: Sequence[int], config: PPOConfig
-    ) -> None:
-        super().__init__(env, actor, seeds, config)
-        self.each = env.num_envs // len(seeds)
-
     @property
     def stride(self) -> int:
         """Environment steps of each seed in an update."""
@@ -167,10 +158,7 @@ class OneLevelPPO(PPO):
         return self.env.success.reshape(len(self.seeds), -1).mean(1)
 
     def segment(self) -> Array:
-        """One update, of at least two segments for each minibatch; mean rewards (seeds,)."""
-        size, parts = self.config.steps * self.each, self.config.minibatches
-        if size < 2 * parts:
-            raise ValueError(f"wanted two segments for each of {parts} minibatches, got {size}")
+        """One update; mean rewards (seeds,)."""
         total = self.update()["episode_return"]
         return np.asarray(total / (self.config.steps * self.env.reward_scale), dtype=float)
 

@@ -2,13 +2,11 @@
 
 The algorithm is the usual one (Schulman et al. 2017): clipped surrogate, generalised advantage
 estimation, time limits bootstrapped. Everything carries a leading axis of seeds S, and no operation
-mixes seeds: advantages are normalised, gradients are clipped and minibatches are drawn a seed at a
-time, so a seed learns the same alone and in a batch. PPO and C-PPO differ in the policy that is
-passed in, and in nothing else.
+mixes seeds, so a seed learns the same alone and in a batch. PPO and C-PPO differ in the policy that
+is passed in, and in nothing else.
 
-An update starts by resetting the environment with integers derived from (seed, update). The state
-of a training is therefore its weights, Adam's moments and the number of updates done, and one that
-is killed and resumed ends with the weights of one that was not.
+An update starts by resetting the environment with integers derived from (seed, update): the state
+of a training is its weights, Adam's moments and the number of updates done.
 """
 
 from __future__ import annotations
@@ -77,11 +75,12 @@ class PPO(Resumable):
         if not self.seeds or env.num_envs % len(self.seeds):
             wanted = f"at least one, a number that divides {env.num_envs} trajectories"
             raise ValueError(f"seeds: wanted {wanted}; got {len(self.seeds)}")
+        self.each = env.num_envs // len(self.seeds)  # trajectories of a seed
         first, info = env.reset(seed=self._environment_seeds(0))
         inputs = info.get("privileged", first).shape[-1]
         self.critic = StackedMLP(inputs, 1, self.config.critic_hidden, seeds=self.seeds, last=0.1)
         n = env.single_action_space.shape[0]  # type: ignore[index]
-        lead = (len(self.seeds), env.num_envs // len(self.seeds))
+        lead = (len(self.seeds), self.each)
         with torch.no_grad():
             found = policy(torch.as_tensor(first).reshape(*lead, -1)).shape
         if tuple(found) != (*lead, n):
@@ -97,7 +96,7 @@ class PPO(Resumable):
     @property
     def episodes(self) -> int:
         """Trajectories of `config.steps` steps that each seed has seen."""
-        return self.updates * (self.env.num_envs // len(self.seeds))
+        return self.updates * self.each
 
     @single_thread()
     def update(self) -> dict[str, Any]:
@@ -108,6 +107,8 @@ class PPO(Resumable):
         `value_loss`, `clip_fraction`, and `std` (S, n).
         """
         c = self.config
+        if (size := c.steps * self.each) < 2 * c.minibatches:
+            raise ValueError(f"wanted 2 steps for each of {c.minibatches} minibatches, got {size}")
         generators = [np.random.default_rng([seed, self.updates]) for seed in self.seeds]
         begin, spread = self._environment_seeds(self.updates), self.log_std.detach()
         rollout = collect(self.env, self.policy, spread, begin, generators, c.steps)
@@ -182,13 +183,13 @@ class PPO(Resumable):
         """
         c = self.config
         observation, privileged, action, scalars = batch.split(self._columns, -1)
-        old_log_probability, advantage, target = scalars.unbind(-1)
+        old, advantage, target = scalars.unbind(-1)
         spread, centre = torch.std_mean(advantage, dim=1, keepdim=True)
         advantage = (advantage - centre) / (spread + 1e-8)
         mean, value = self.policy(observation), self.critic(privileged)
         with torch.no_grad():
             to_mean, to_log_std, ratio = surrogate_gradient(
-                mean, self.log_std, action, old_log_probability, advantage, c.clip
+                mean, self.log_std, action, old, advantage, c.clip
             )
             error = value - target.unsqueeze(-1)
             to_value = (2.0 * c.value_weight / error.shape[1]) * error
@@ -247,7 +248,7 @@ def collect(
         floats[2][:, t], floats[3][:, t] = reached.reshape(S, E, -1), action
         for array, part in zip(scalars, (gain, end, end | limit), strict=True):
             array[:, t] = part.reshape(S, E)
-    saw, knew, arrived, acted, kicked = (torch.from_numpy(array) for array in (*floats, noise))
+    saw, knew, arrived, acted, kicked = map(torch.from_numpy, (*floats, noise))
     return Rollout(saw, knew, arrived, acted, kicked, *scalars)
 
 
@@ -279,12 +280,7 @@ def generalised_advantage(
 
 
 def surrogate_gradient(
-    mean: Tensor,
-    log_std: Tensor,
-    action: Tensor,
-    old_log_probability: Tensor,
-    advantage: Tensor,
-    clip: float,
+    mean: Tensor, log_std: Tensor, action: Tensor, old: Tensor, advantage: Tensor, clip: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gradient of the clipped surrogate for a Gaussian policy, by mean and log_std.
 
@@ -293,14 +289,14 @@ def surrogate_gradient(
         dL/dlog p = -r A / m   where r A is the smaller of the two, and 0 where it is clipped,
         dlog p/dmean = x / std,   dlog p/dlog_std = x^2 - 1   with x = (action - mean) / std.
 
-    Shapes: mean and action (S, m, n), log_std (S, 1, n), the rest (S, m); `old_log_probability` is
+    Shapes: mean and action (S, m, n), log_std (S, 1, n), the rest (S, m); `old` is log p_old
     without its constant -n/2 log 2 pi. Returns dL/dmean, dL/dlog_std and the ratio r (S, m).
     """
     precision = torch.exp(-log_std)
     x = (action - mean) * precision
     square = x * x
     log_probability = -(0.5 * square + log_std).sum(-1)
-    ratio = torch.exp(log_probability - old_log_probability)
+    ratio = torch.exp(log_probability - old)
     gain = ratio * advantage
     active = gain <= ratio.clamp(1.0 - clip, 1.0 + clip) * advantage
     slope = (gain * active).mul_(-1.0 / advantage.shape[1]).unsqueeze(-1)

@@ -18,10 +18,8 @@ from cmc.studies.runner import Folder, Progress, find, load, marks_of
 from cmc.studies.study import Rows, Study, Test, checked_methods, checked_study
 from cmc.theory.arrays import count
 
-CURVE = 100
-"""Points of a learning curve."""
-FORMAT = 3
-"""Of kept tests; raised when their figures change, so that older ones are not used."""
+CURVE = 100  # points of a learning curve
+FORMAT = 3  # of kept tests; raised when their figures change, so that older ones are not used
 Tables = dict[str, Rows]
 
 
@@ -81,7 +79,7 @@ def _files(
     checkpoints = None if checkpoints is None else store.as_path("checkpoints", checkpoints)
     files = {
         name: find(study, name, checkpoints) if methods[name].trained else None
-        for name in checked_methods("names", study, methods if names is None else names)
+        for name in checked_methods("names", study, methods if names is None else names, least=1)
     }
     if names is None:
         files = {name: file for name, file in files.items() if file is None or file.is_file()}
@@ -92,8 +90,6 @@ def _files(
                 where = f"in {checkpoints}, wanted its folder; it holds {', '.join(others[:3])}"
                 where = where if others else f"in {checkpoints}"
             raise store.CheckpointError(f"no checkpoint of {study.name} {where}")
-    if not files:
-        raise ValueError("names: wanted at least one method, got none")
     return files
 
 

@@ -77,7 +77,7 @@ def live_task(study: Study, starts: int = 5) -> dict[str, Any]:
 def live_policies(study: Study, methods: Sequence[str]) -> list[dict[str, Any]]:
     """Planner and low level of every shipped policy and seed of methods, as nested lists."""
     found = []
-    for name in checked_methods("methods", _arm(study), methods):
+    for name in checked_methods("methods", _arm(study), methods, least=1):
         if study.config_of(name).task.command != "pose":
             raise ValueError(f"{name} moves joints; a live page plays methods that move the tip")
         kept = []

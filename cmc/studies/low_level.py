@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from cmc.learning.latent import LatentConfig, LatentLow, LatentModel, Rollouts
 from cmc.learning.state import single_thread
 from cmc.studies.peg_push import STUDY
-from cmc.studies.study import Array
+from cmc.studies.study import Array, checked_seeds
 from cmc.studies.two_level import capped_actor
 
 UPDATES, TUNED, JUDGED = 300, 128, 1024
@@ -117,12 +117,14 @@ def table(
     updates: int = UPDATES,
 ) -> pd.DataFrame:
     """A row for each setting (`test`), method and seed, with its `cost`."""
-    rows = []
+    if not settings or not set(settings) <= set(SETTINGS):
+        raise ValueError(f"settings: wanted some of {', '.join(SETTINGS)}, got {settings!r}")
+    rows, seeds = [], checked_seeds(seeds)
     with single_thread():
         nominal = search(rollouts())
         for setting in settings:
             world = rollouts(**SETTINGS[setting])
-            found = dict(zip(("start", "learned"), learn(world, list(seeds), updates), strict=True))
+            found = dict(zip(("start", "learned"), learn(world, seeds, updates), strict=True))
             gains = cost(world, Gains(np.stack([nominal, search(world)])), 2, JUDGED, 2)
             found |= {"nominal gain": gains[:1], "searched gain": gains[1:]}
             for method, costs in found.items():

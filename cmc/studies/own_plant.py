@@ -74,22 +74,17 @@ class PenalisedPPO(PPO):
         return report
 
 
-class LQR(nn.Module):
-    """a = -K (z, int z), the linear-quadratic regulator of the tanks at the goal."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        zero = np.zeros((2, 2))
-        Lambda = SPACE.T_y @ PLANT.f_y(GOAL, U0) @ np.linalg.inv(SPACE.T_y)
-        A = np.block([[Lambda, zero], [np.eye(2), zero]])
-        B = np.vstack([SPACE.T_y @ PLANT.f_u(GOAL, U0) @ SPACE.T_a, zero])
-        K, _, _ = control.lqr(A, B, np.diag([1.0, 1.0, 0.1, 0.1]), 0.5 * np.eye(2))
-        order = [0, 2, 1, 3]  # s is (z1, int z1, z2, int z2)
-        self.K = nn.Parameter(torch.as_tensor(K[:, order], dtype=torch.float32))
-
-    def forward(self, s: Tensor) -> Tensor:
-        """Maps s flat (..., 4) to a (..., 2)."""
-        return -s @ self.K.T
+def lqr() -> nn.Linear:
+    """The linear-quadratic regulator of the tanks at the goal, a = -K (z, int z)."""
+    zero = np.zeros((2, 2))
+    Lambda = SPACE.T_y @ PLANT.f_y(GOAL, U0) @ np.linalg.inv(SPACE.T_y)
+    A = np.block([[Lambda, zero], [np.eye(2), zero]])
+    B = np.vstack([SPACE.T_y @ PLANT.f_u(GOAL, U0) @ SPACE.T_a, zero])
+    K, _, _ = control.lqr(A, B, np.diag([1.0, 1.0, 0.1, 0.1]), 0.5 * np.eye(2))
+    policy = nn.Linear(4, 2, bias=False)
+    s = [0, 2, 1, 3]  # is (z1, int z1, z2, int z2)
+    policy.weight = nn.Parameter(torch.as_tensor(-K[:, s], dtype=torch.float32))
+    return policy
 
 
 def of_seed(policy: nn.Module, k: int) -> Any:
@@ -97,7 +92,7 @@ def of_seed(policy: nn.Module, k: int) -> Any:
 
     def action(s: Array) -> Array:
         flat = np.reshape(s, (1, -1, 4))
-        wide = flat if isinstance(policy, LQR) else np.repeat(flat, len(SEEDS), axis=0)
+        wide = flat if isinstance(policy, nn.Linear) else np.repeat(flat, len(SEEDS), axis=0)
         with torch.no_grad():
             a = policy.double()(torch.as_tensor(wide, dtype=torch.float64)).numpy()
         return np.asarray(a[min(k, len(a) - 1)].reshape(*np.shape(s)[:-2], 2))
@@ -145,7 +140,7 @@ METHODS: dict[str, tuple[str, type[PPO] | None, Callable[[], nn.Module]]] = {
     "penalty": ("PPO with a Jacobian penalty", PenalisedPPO, free),
     "cppo": ("C-PPO", PPO, lambda: ModularPolicy(PositiveNetwork(2, seeds=SEEDS, **BOUNDS))),
     "convex": ("convex-gradient PI", PPO, convex),
-    "lqr": ("LQR", None, LQR),
+    "lqr": ("LQR", None, lqr),
 }
 """Title, learner, and the policy of all seeds side by side."""
 

@@ -48,10 +48,8 @@ from cmc.studies.two_level import METHODS, TwoLevelConfig, light
 from cmc.studies.two_level_tests import judge, motion
 from cmc.theory.arrays import number
 
-TIME_CONSTANT = 0.01
-"""Of contact in the scene, s."""
-CONTACT = ("ctd3", "frozen", "td3")
-"""Methods that are tested under other contact."""
+TIME_CONSTANT = 0.01  # of contact in the scene, s
+CONTACT = ("ctd3", "frozen", "td3")  # methods that are tested under other contact
 
 
 @cache

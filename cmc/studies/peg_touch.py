@@ -71,7 +71,9 @@ class TouchConfig:
 
 
 class TouchTraining(PPO):
-    """PPO on peg touch with the face of a study's training; it counts episodes."""
+    """PPO on peg touch with the face of a study's training, whose steps are episodes."""
+
+    steps = PPO.episodes
 
     def __init__(self, config: TouchConfig, policy: nn.Module, seeds: Sequence[int]) -> None:
         self.stride = config.episodes_per_update
@@ -80,11 +82,6 @@ class TouchTraining(PPO):
         if config.noise is not None:
             with torch.no_grad():
                 self.log_std.copy_(torch.tensor(config.noise).expand_as(self.log_std))
-
-    @property
-    def steps(self) -> int:
-        """Episodes of each seed so far."""
-        return self.episodes
 
     def segment(self) -> Array:
         """One update; mean returns (seeds,)."""
@@ -143,9 +140,6 @@ def fixed(*gains: tuple[float, float]) -> Network:
     return lambda config, seeds: ModularPolicy(LinearNetwork(np.array(gains)))
 
 
-# -- methods --------------------------------------------------------------------------------------
-
-
 def arm(title: str, network: Network, *steps: Change, trained: bool = True) -> Method:
     """A method that trains a network by PPO, and what it changes of the configuration."""
     build = lambda config, seeds: TouchTraining(config, network(config, seeds), seeds)  # noqa: E731
@@ -153,12 +147,12 @@ def arm(title: str, network: Network, *steps: Change, trained: bool = True) -> M
 
 
 RAW, IDENTITY = (changed(task={"interface": name}) for name in ("raw", "identity"))
+# The vertical action is multiplied by 16 N/m, the middle of the range, over the nominal K.
 SCALED = changed(task={"stiffness_reference": 16.0})
-"""The vertical action is multiplied by 16 N/m, the middle of the range, over the nominal K."""
+# PPO set aggressively: large steps, more epochs, no floor under the noise.
 STRESS = changed(ppo={"learning_rate": 3e-3, "epochs": 10, "log_std_floor": -20.0})
-"""PPO set aggressively: large steps, more epochs, no floor under the noise."""
+# Little noise vertically, and as much as horizontally.
 QUIET, LOUD = changed(noise=(-1.0, -3.0)), changed(noise=(-1.0, -1.0))
-"""Little noise vertically, and as much as horizontally."""
 BYPASS = [[0.0, 0.0], [0.15, 0.6]]  # shares of the limit, vertically; our choice
 FREE, CPPO, CAPPED = modular(IndependentNetwork), positive(), positive(capped=True)
 PI, PI_SCALED = fixed((2.0, 40.0), (0.02, 8.0)), fixed((2.0, 40.0), (0.012, 5.6))
@@ -208,9 +202,6 @@ CAPS: dict[str, Method] = {
     "none_bypass": arm("no cap, the same bypass", positive(floor=BYPASS), LOUD),
     "none_quiet": arm("no cap, little noise", CPPO, QUIET),
 }
-
-
-# -- tests --------------------------------------------
 
 
 def change(shift: str, h: float | None = None) -> Change:

@@ -31,25 +31,18 @@ SHIFTS: dict[str, PegShift] = {
     "all, fast": PegShift(tau_x=0.5, tau_z=0.5, K_sur=2.0, surface=1.5),
 }
 """The paper's shifts of the plant, singly and jointly; the controller keeps the nominal model."""
-ERROR_BINS: Array = np.logspace(-5, 2, 57)
-"""Edges of the histograms of force errors, N."""
+ERROR_BINS: Array = np.logspace(-5, 2, 57)  # edges of the histograms of force errors, N
 
 # All that follows is our choice; the paper's test has 8000 trajectories for each checkpoint.
+# Length of a test, four training episodes, and of the tail that is judged, s; below 0.5 s of tail
+# transients pass for drift.
 DURATION, WINDOW = 2.0, 1.0
-"""Length of a test, four training episodes, and of the tail that is judged, s; below 0.5 s of tail
-transients pass for drift."""
-SEED = 20_231_103
-"""Random stream of the tests; never used in training."""
-SIGN_EVERY = 25
-"""Steps between two samples of the slopes on visited states."""
-THRESHOLD: Array = np.array([0.02, 0.10])
-"""Smallest movement or error that counts, m and N."""
+SEED = 20_231_103  # random stream of the tests; never used in training
+SIGN_EVERY = 25  # steps between two samples of the slopes on visited states
+THRESHOLD: Array = np.array([0.02, 0.10])  # smallest movement or error that counts, m and N
+# Of an oscillation: zero crossings of the detrended tail, and the smallest peak-to-peak of the
+# tail's second half over that of its first.
 CROSSINGS, PERSISTENCE = 4, 0.7
-"""Of an oscillation: zero crossings of the detrended tail, and the smallest peak-to-peak of the
-tail's second half over that of its first."""
-
-
-# -- one test -----------------------------------------------------------------
 
 
 def judge(config: Any, policy: nn.Module, seeds: int, test: Test) -> dict[str, Rows]:
@@ -172,9 +165,6 @@ def detect(error: ArrayLike, h: float) -> dict[str, Flags]:
     return {"oscillation": oscillation, "drift": drift, "offset": offset}
 
 
-# -- what is predicted --------------------------------------------------------
-
-
 def equilibrium(policy: nn.Module, envs: PegTouchVectorEnv, seeds: int) -> tuple[Tensor, Flags]:
     """The input (0, I*) at which a contracting policy holds the targets, by bisection.
 
@@ -220,9 +210,6 @@ def predicted_oscillation(policy: nn.Module, s: Tensor, envs: PegTouchVectorEnv)
     k1, k2 = np.moveaxis(np.maximum(slope, 0.0), -1, 0)
     K = K.reshape(*slope.shape[:2], 2)
     return np.any(sampled_margin(k1, k2, tau, K, c.h) < 0, axis=-1)
-
-
-# -- what the weights guarantee -------------------------------------------------------------------
 
 
 def signed(policy: nn.Module) -> bool:
@@ -274,9 +261,6 @@ def certificates(policy: nn.Module, task: PegTouchConfig, limit: Array) -> Rows:
             }
         )
     return rows
-
-
-# -- one episode as arrays ------------------------------------------------------------------------
 
 
 def motion(config: Any, policy: nn.Module, episode: int) -> dict[str, Any]:

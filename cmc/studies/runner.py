@@ -25,13 +25,8 @@ from cmc.theory.arrays import count, refuse_uncallable
 Callback = Callable[[dict[str, Any]], object]
 Progress = Callable[[int, int, str], object]
 Folder = str | Path | None
-SAVE_EVERY = 60.0
-"""Longest time between two savings of a training, s."""
-MOST = 10**9
-"""Steps or episodes of a training."""
-
-
-# -- training -------------------------------------------------------------------------------------
+SAVE_EVERY = 60.0  # longest time between two savings of a training, s
+MOST = 10**9  # steps or episodes of a training
 
 
 def train(
@@ -61,10 +56,8 @@ def train(
         raise ValueError(f"{name!r} has fixed gains: there is nothing to train")
     seeds = checked_seeds(seeds)
     folder = store.as_path("out", Path("runs") / study.name if out is None else out)
-    packed, state = (
-        folder / f"{study.name}_{name}.safetensors",
-        folder / f"{name}_state.safetensors",
-    )
+    packed = folder / f"{study.name}_{name}.safetensors"
+    state = folder / f"{name}_state.safetensors"
     record = _record(study, name, seeds, total)
     identity = {key: record[key] for key in ("study", "method", "configuration")}
     training, (kept, curve) = study.build(name, seeds), _resumed(packed, state, record)
@@ -146,9 +139,6 @@ def _record(study: Study, name: str, seeds: Sequence[int], total: int) -> dict[s
     made = store.provenance(f"{command} --{study.unit}s {total}", list(seeds))
     settings = plain({"every": study.every, **asdict(study.config_of(name))})
     return {"study": study.name, "method": name, "configuration": settings, **made}
-
-
-# -- what was learned -----------------------------------------------------------------------------
 
 
 class Loaded(NamedTuple):

@@ -28,8 +28,7 @@ from cmc.envs.peg_maze import SOFT, STIFF, PegMaze
 from cmc.envs.vector import Array
 from cmc.studies.study import changed
 
-SLOPE = 20.0 * np.array([1.0] * 3 + [0.1] * 3)
-"""Of the fixed low level at zero, du/dy, our choice."""
+SLOPE = 20.0 * np.array([1.0] * 3 + [0.1] * 3)  # du/dy of the fixed low level at zero, our choice
 WALLS = {  # axis: where the tip starts, and the sub-goal behind the wall
     "x": ((0.4290, -0.0190, 0.008), (0.4000, -0.0190, 0.008)),
     "y": ((0.4180, -0.0150, 0.008), (0.4180, -0.0300, 0.008)),

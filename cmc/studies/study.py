@@ -9,11 +9,10 @@ from operator import index
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import nn
 
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array
+
 Rows = list[dict[str, Any]]
 Change = Callable[[Any], Any]
 """A configuration to another one."""
@@ -145,11 +144,13 @@ def checked_study(study: Any) -> Study:
     return study
 
 
-def checked_methods(name: str, study: Study, methods: Any) -> list[str]:
+def checked_methods(name: str, study: Study, methods: Any, least: int = 0) -> list[str]:
     """Names of a study's methods, or a ValueError."""
     if isinstance(methods, str) or not isinstance(methods, Iterable):
         raise ValueError(f"{name}: wanted a list of methods, got {methods!r}")
     found = list(methods)
+    if len(found) < least:
+        raise ValueError(f"{name}: wanted at least one method, got none")
     for method in found:
         checked_study(study).method(method)
     return found

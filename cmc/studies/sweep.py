@@ -46,9 +46,7 @@ def sweep(
     of a scheduler or in a cluster of `jobs` processes made for it. `length` and `out` are those of
     `runner.train`.
     """
-    names = checked_methods("names", studies.get(study), names)
-    if not names:
-        raise ValueError("names: wanted at least one method, got none")
+    names = checked_methods("names", studies.get(study), names, least=1)
     seeds = checked_seeds(seeds)
     size = count("group", len(seeds) if group is None else group)
     if backend not in ("loky", "dask"):

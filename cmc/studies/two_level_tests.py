@@ -18,8 +18,7 @@ from cmc.studies.two_level import N, Policy, TwoLevelConfig
 from cmc.theory.arrays import count
 
 TEST_SEED = 900_000  # test worlds never share a stream with training
-PUSH = 2.0
-"""Force on the tip when consistency under pushes is measured, N."""
+PUSH = 2.0  # force on the tip when consistency under pushes is measured, N
 KEPT = ("reward", "success", "distance", "contact_force", "contact_force_max", "penetration")
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 
@@ -32,10 +31,10 @@ def judge(config: TwoLevelConfig, policy: Policy, seeds: int, test: Test) -> dic
     rows = figures(found)
     if test.change is not same:
         return {"tests": rows, "episodes": []}
-    moved = consistency(config, policy[1], seeds)
+    own = {key: 1e3 * value for key, value in consistency(config, policy[1], seeds).items()}
+    own |= _gains(config, policy[1], seeds)
     for k, row in enumerate(rows):
-        row |= {key: 1e3 * float(value[k]) for key, value in moved.items()}
-        row |= _gains(config, policy[1], seeds, k)
+        row |= {key: float(value[k]) for key, value in own.items()}
     near, far = 1e3 * found["distance"].min(0), 1e3 * found["distance"][-1]
     each = [
         {"seed": k, "episode": e, "nearest_mm": near[k, e], "final_mm": far[k, e]}
@@ -75,41 +74,21 @@ def figures(found: Mapping[str, Array]) -> Rows:
     ]
 
 
-def _gains(config: TwoLevelConfig, low: LowLevel, seeds: int, k: int) -> dict[str, float]:
-    """Slopes at rest of one seed, and what construction keeps them below."""
-    actor = getattr(low, "actor", None)
-    if config.task.command == "joint" or actor is None:
+def _gains(config: TwoLevelConfig, low: LowLevel, seeds: int) -> dict[str, Array]:
+    """Slopes du/dy at rest, by a central difference, and what construction keeps them below.
+
+    By seed, (seeds,) each; nothing without an actor, or in joint space.
+    """
+    if config.task.command == "joint" or low.actor is None:
         return {}
-    net, columns = getattr(actor, "network", None), {"slope": slope_at_rest(config, low, seeds)[k]}
-    if isinstance(net, PositiveNetwork) and net.joint is not None:
-        columns["cap"] = config.slope_cap()
-    return {
-        f"{key}_{axis}": float(v[i]) for key, v in columns.items() for i, axis in enumerate(AXES)
-    }
-
-
-def _asked(config: TwoLevelConfig, low: LowLevel, seeds: int) -> None:
-    """The door for what a low level is tested with."""
-    for name, value, kind in (("config", config, TwoLevelConfig), ("low", low, LowLevel)):
-        if not isinstance(value, kind):
-            raise ValueError(f"{name}: wanted a {kind.__name__}, got {value!r}")
-    count("seeds", seeds)
-
-
-def slope_at_rest(config: TwoLevelConfig, low: LowLevel, seeds: int) -> Array:
-    """Slope du/dy at rest of every dimension, (seeds, 6), by a central difference."""
-    _asked(config, low, seeds)
-    if config.task.command == "joint":
-        raise ValueError("slopes in y: wanted a low level of the tip, got one of the joints")
-    if low.actor is None:
-        return np.zeros((seeds, N))
     seen, index, eps = np.zeros((seeds, 2 * N, 4 * N + 1)), np.arange(N), 1e-4
     seen[:, index, index], seen[:, N + index, index] = eps, -eps
     u = low.act(seen, explore=False)
-    return (u[:, index, index] - u[:, N + index, index]) / (2 * eps)
-
-
-# -- consistency ----------------------------------------------------------------------------------
+    columns = {"slope": (u[:, index, index] - u[:, N + index, index]) / (2 * eps)}
+    net = getattr(low.actor, "network", None)
+    if isinstance(net, PositiveNetwork) and net.joint is not None:
+        columns["cap"] = np.tile(config.slope_cap(), (seeds, 1))
+    return {f"{key}_{axis}": v[:, i] for key, v in columns.items() for i, axis in enumerate(AXES)}
 
 
 def consistency(
@@ -128,13 +107,18 @@ def consistency(
     summed variances of the displacement over starts; `push_mm`, the root mean square distance
     between the segment's ends with the push and without it.
     """
-    _asked(config, low, seeds)
+    for name, value, kind in (("config", config, TwoLevelConfig), ("low", low, LowLevel)):
+        if not isinstance(value, kind):
+            raise ValueError(f"{name}: wanted a {kind.__name__}, got {value!r}")
     bounds: dict[str, Any] = {}  # none that would shorten a step near the edge
     for name in ("subgoal", "workspace"):
         size = len(getattr(config.task, f"{name}_low"))
         bounds |= {f"{name}_low": (-1.0,) * size, f"{name}_high": (1.0,) * size}
     free = replace(config, task=replace(config.task, scene="panda.xml", **bounds))
-    task, rng = free.make(seeds * count("starts", starts)), np.random.default_rng(TEST_SEED)
+    task, rng = (
+        free.make(count("seeds", seeds) * count("starts", starts)),
+        np.random.default_rng(TEST_SEED),
+    )
     task.seed([TEST_SEED + 1 + k for k in range(starts)] * seeds)
     task.reset()
     ends = np.array(config.task.subgoal_low), np.array(config.task.subgoal_high)
@@ -186,9 +170,6 @@ def _segment(
             task.worlds.push(push)
         seen = task.select(obs, low_fields(task)).reshape(seeds, task.num // seeds, -1)
         obs, *_ = task.step(low.act(seen, explore=False).reshape(task.num, -1))
-
-
-# -- one episode as arrays ------------------------------------------------------------------------
 
 
 def motion(config: TwoLevelConfig, policy: Policy, episode: int) -> dict[str, Any]:
