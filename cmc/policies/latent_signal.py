@@ -20,13 +20,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from cmc.policies.networks import PositiveNetwork
-from cmc.theory.arrays import checked, count, number, refuse_uncallable
-
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array, checked, count, number, refuse_uncallable, refuse_unless
 
 
 class LatentSignal(PositiveNetwork):
@@ -128,10 +126,8 @@ def improve(
     `rate`. Returns the cost before each update, and after the last.
     """
     refuse_uncallable("signal", signal)
-    if not isinstance(policy, nn.Module) or not isinstance(trial, Trial):
-        raise TypeError(
-            f"policy needs a torch module and trial a Trial, got {policy!r:.60}, {trial!r:.60}"
-        )
+    refuse_unless(isinstance(policy, nn.Module), "policy", "a torch module", policy)
+    refuse_unless(isinstance(trial, Trial), "trial", "a Trial", trial)
     checked("gains", gains, "2")
     updates, rate = count("updates", updates), number("rate", rate, above=0.0)
     parts = [part for part in (signal, policy) if isinstance(part, nn.Module)]
