@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import Array, checked, filled, not_square, refuse_unless, together
+from cmc.theory.arrays import Array, checked, filled, need, not_square, together
 from cmc.theory.auxiliary import AuxiliarySpace, decompose
 from cmc.theory.identification import complex_step, differences, equilibrium, jacobian_fault
 
@@ -153,10 +153,10 @@ class FunctionPlant(Plant):
     def __init__(self, f: Any, y: Any, u: Any, own: Any, name: Any, words: Any, units: Any) -> None:
         if not all(isinstance(box, (list, tuple, np.ndarray)) and len(box) == 2 for box in (y, u)):
             raise ValueError(f"y and u each need (low, high), got y = {y!r}, u = {u!r}")
-        refuse_unless(isinstance(name, str), "name", "a string", name)
-        refuse_unless(callable(f), "f", "a function", f)
+        need(isinstance(name, str), "name", "a string", name)
+        need(callable(f), "f", "a function", f)
         for word, given in zip(("f_y", "f_u"), own, strict=True):
-            refuse_unless(given is None or callable(given), word, "a function", given)
+            need(given is None or callable(given), word, "a function", given)
         self.y_low = checked("y[0]", y[0], "n").copy()
         self.name, self.n = name, len(self.y_low)
         self.y_high = checked("y[1]", y[1], "n", n=self.n).copy()

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from cmc.policies.networks import PositiveNetwork
-from cmc.theory.arrays import Array, checked, count, number, refuse_uncallable, refuse_unless
+from cmc.theory.arrays import Array, checked, count, need, number
 
 
 class LatentSignal(PositiveNetwork):
@@ -82,7 +82,7 @@ class Trial:
         number("effort", self.effort, least=0.0)
         number("duration", self.duration, above=0.0)
         count("steps", self.steps, 100_000)
-        refuse_uncallable("priced", self.priced)
+        need(callable(self.priced), "priced", "a function", self.priced)
 
     def cost(self, act: Callable[[Tensor, Tensor, int], Tensor]) -> Tensor:
         """The cost of p = act(e, e', k) at step k."""
@@ -125,9 +125,9 @@ def improve(
     s = (y, int y), (..., n, 2), to (..., n); `gains` are K_p and K_d, `updates` Adam's, of step
     `rate`. Returns the cost before each update, and after the last.
     """
-    refuse_uncallable("signal", signal)
-    refuse_unless(isinstance(policy, nn.Module), "policy", "a torch module", policy)
-    refuse_unless(isinstance(trial, Trial), "trial", "a Trial", trial)
+    need(callable(signal), "signal", "a function", signal)
+    need(isinstance(policy, nn.Module), "policy", "a torch module", policy)
+    need(isinstance(trial, Trial), "trial", "a Trial", trial)
     checked("gains", gains, "2")
     updates, rate = count("updates", updates), number("rate", rate, above=0.0)
     parts = [part for part in (signal, policy) if isinstance(part, nn.Module)]

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from cmc.policies.stacked import SignalNetwork, check_tensor, tanh
-from cmc.theory.arrays import Array, checked, filled, refuse_unless
+from cmc.theory.arrays import Array, checked, filled, need
 
 Real = NDArray[np.floating]
 Function = Callable[[Real], Real]
@@ -60,7 +60,7 @@ class ModularPolicy(nn.Module):
         self.squash = squash
         self.n = int(network.n)  # type: ignore[arg-type]
         fits = layout is None or isinstance(layout, Mapping)
-        refuse_unless(fits, "layout", "a mapping of names to slices", layout)
+        need(fits, "layout", "a mapping of names to slices", layout)
         self.layout = {"s": slice(0, 2 * self.n)} if layout is None else dict(layout)
         parts = self.layout.values()
         signals = set(self.layout) - {"R", "T_a"} if all(isinstance(p, slice) for p in parts) else 0
@@ -151,7 +151,7 @@ class DirectPolicy(nn.Module):
     ) -> None:
         super().__init__()
         _check_network(network)
-        refuse_unless(isinstance(part, slice), "part", "a slice of the observation", part)
+        need(isinstance(part, slice), "part", "a slice of the observation", part)
         self.network, self.part, self.squash = network, part, squash
         self.n = int(network.n)  # type: ignore[arg-type]
         centre = torch.as_tensor(filled("u0", u0, self.n), dtype=_dtype(network))
@@ -173,7 +173,7 @@ class DirectPolicy(nn.Module):
 
 def _check_network(network: Any) -> None:
     fits = isinstance(network, nn.Module) and hasattr(network, "n")
-    refuse_unless(fits, "network", "a torch module with n", network)
+    need(fits, "network", "a torch module with n", network)
 
 
 def _dtype(module: nn.Module) -> torch.dtype:
@@ -187,7 +187,7 @@ def as_numpy(policy: nn.Module) -> Function:
     observation that is not finite. Stacked tanh networks run in numpy, which for the few rows of a
     control step costs a fifth of a call into torch; any other policy runs in torch.
     """
-    refuse_unless(isinstance(policy, nn.Module), "policy", "a torch module", policy)
+    need(isinstance(policy, nn.Module), "policy", "a torch module", policy)
     if any(part.device.type != "cpu" for part in chain(policy.parameters(), policy.buffers())):
         policy = copy.deepcopy(policy).cpu()
     dtype = torch.empty(0, dtype=_dtype(policy)).numpy().dtype

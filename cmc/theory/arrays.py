@@ -100,10 +100,10 @@ def count(name: str, value: float, most: int = 1_000_000) -> int:
 
 def refuse_uncallable(name: str, value: Any) -> None:
     """Raise a TypeError where `value` cannot be called."""
-    refuse_unless(callable(value), name, "a function", value)
+    need(callable(value), name, "a function", value)
 
 
-def refuse_unless(fits: bool, name: str, wish: str, value: Any) -> None:
+def need(fits: bool, name: str, wish: str, value: Any) -> None:
     """Raise a TypeError where `value` is not of the kind that was wished for."""
     if not fits:
         raise TypeError(f"{name} needs {wish}, got {_short(value)}")

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import Array, filled, number, refuse_unless
+from cmc.theory.arrays import Array, filled, need, number
 from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.ball import ball_everywhere
 from cmc.theory.certificates import Certificate, Progress, common_metric, corners, rates_in
@@ -78,11 +78,10 @@ def certify(
     if not (isinstance(kind, str) and kind in ("exact", "frozen")):
         raise ValueError(f"kind needs to be 'exact' or 'frozen', got {kind!r}")
     fits = all(hasattr(plant, name) for name in ("n", "f", "f_y", "f_u", "constant"))
-    refuse_unless(fits, "plant", "n, f, f_y, f_u and constant, as Plant has", plant)
-    fits = region is None or isinstance(region, Region)
-    refuse_unless(fits, "region", "a Region or None", region)
+    need(fits, "plant", "n, f, f_y, f_u and constant, as Plant has", plant)
+    need(region is None or isinstance(region, Region), "region", "a Region or None", region)
     fits = progress is None or callable(progress)
-    refuse_unless(fits, "progress", "a function of a line of text", progress)
+    need(fits, "progress", "a function of a line of text", progress)
     y_ref = filled("y_ref", y_ref, plant.n)
     h = None if h is None else number("h", h, above=0.0)
     domain = "continuous" if h is None else "sampled"
@@ -104,8 +103,7 @@ def certify(
         centre = spaces(np.mean(box.corners, axis=0))
     except (ValueError, np.linalg.LinAlgError) as error:
         return refuse(f"{error}{_instead(plant, transforms)}")
-    fits = isinstance(centre, AuxiliarySpace)
-    refuse_unless(fits, "transforms", "to return an AuxiliarySpace", centre)
+    need(isinstance(centre, AuxiliarySpace), "transforms", "to return an AuxiliarySpace", centre)
     if (centre.gains == 0).any():
         return refuse("R has a zero on its diagonal: some action does not move its own signal")
     if callable(transforms) or not plant.constant:

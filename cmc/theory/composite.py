@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from cmc.theory.arrays import Array, checked, filled, not_overflown, number, refuse_unless, together
+from cmc.theory.arrays import Array, checked, filled, need, not_overflown, number, together
 from cmc.theory.certificates import Certificate, common_metric, corners
 
 Root = Literal["small", "large"]
@@ -192,8 +192,7 @@ def _slopes(name: str, part: Any, **sizes: Any) -> tuple[Array, Array]:
     if isinstance(part, CompositeModel):
         bounds = [np.stack([np.atleast_1d(part.K1), np.atleast_1d(part.K2)], axis=-1)] * 2
     else:
-        known = hasattr(part, "slope_bounds")
-        refuse_unless(known, name, "slope_bounds() -> (lower, upper)", part)
+        need(hasattr(part, "slope_bounds"), name, "slope_bounds() -> (lower, upper)", part)
         bounds = part.slope_bounds()
     low, high = (checked(f"{name}.slope_bounds()", bound, "n 2", **sizes) for bound in bounds)
     return low, high

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import logm
 
-from cmc.theory.arrays import Array, checked, not_overflown, not_square, number, refuse_uncallable
+from cmc.theory.arrays import Array, checked, filled, need, not_overflown, not_square, number
 
 _POINTS = 24
 
@@ -27,14 +27,13 @@ def differences(function: Callable[[Array], Array], x: ArrayLike, step: ArrayLik
 
     `step` is half the width of the difference, one number or one for each entry of x, (m,).
     """
-    refuse_uncallable("function", function)
-    x, step = checked("x", x, "... m"), checked("step", step, above=0.0)
-    if step.shape not in ((), x.shape[-1:]):
-        raise ValueError(f"step needs a number or shape {x.shape[-1:]}, got shape {step.shape}")
-    shift = np.diag(np.broadcast_to(step, x.shape[-1:]))
+    need(callable(function), "function", "a function", function)
+    x = checked("x", x, "... m")
+    step = filled("step", step, x.shape[-1], above=0.0)
+    shift = np.diag(step)
     # both ends in one call: a solver inside then takes the same steps for both
     up, down = function(np.stack([x[..., None, :] + shift, x[..., None, :] - shift]))
-    return np.swapaxes((up - down) / (2 * np.diagonal(shift)[:, None]), -1, -2)
+    return np.swapaxes((up - down) / (2 * step[:, None]), -1, -2)
 
 
 def complex_step(function: Callable[[NDArray[np.complex128]], Any], x: ArrayLike) -> Array:
@@ -43,7 +42,7 @@ def complex_step(function: Callable[[NDArray[np.complex128]], Any], x: ArrayLike
     Squire and Trapp 1998: no difference is taken, so h may be tiny. A function that branches on a
     value or takes its size is not analytic; compare with `differences`.
     """
-    refuse_uncallable("function", function)
+    need(callable(function), "function", "a function", function)
     x = checked("x", x, "... m")
     found = function(x[..., None, :] + 1e-30j * np.eye(x.shape[-1]))
     return np.swapaxes(np.imag(found) / 1e-30, -1, -2)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import Array, checked, count, number, refuse_unless
+from cmc.theory.arrays import Array, checked, count, need, number
 from cmc.theory.certificates import Certificate
 from cmc.theory.contraction import metric_factor
 
@@ -64,8 +64,7 @@ class ErrorBall:
         A certificate of a box holds in the box: `fits` says whether the ball around rest does.
         B is (n, m); a period (s) goes with a certificate of a sampled loop.
         """
-        known = isinstance(certificate, Certificate)
-        refuse_unless(known, "certificate", "a Certificate", certificate)
+        need(isinstance(certificate, Certificate), "certificate", "a Certificate", certificate)
         if not certificate.holds or certificate.metric is None:
             raise ValueError(f"no error ball without a certificate: {certificate}")
         if (certificate.domain == "sampled") != (period is not None):
@@ -119,7 +118,7 @@ def random_disturbances(
     random frequency (up to a tenth of the step rate, `step` in s) and phase; an independent draw at
     each step.
     """
-    refuse_unless(isinstance(rng, np.random.Generator), "rng", "a numpy Generator", rng)
+    need(isinstance(rng, np.random.Generator), "rng", "a numpy Generator", rng)
     steps, batch, m = count("steps", steps), count("batch", batch), count("m", m, 1000)
     size, step = number("size", size, least=0.0), number("step", step, above=0.0)
     if steps * batch * m > 10**9:

@@ -17,16 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from cmc.theory.arrays import (
-    Array,
-    checked,
-    increasing,
-    not_overflown,
-    number,
-    refuse_uncallable,
-    refuse_unless,
-    together,
-)
+from cmc.theory.arrays import Array, checked, increasing, need, not_overflown, number, together
 from cmc.theory.auxiliary import AuxiliarySpace, applied, decompose
 from cmc.theory.identification import equilibrium
 from cmc.theory.sampled import hold
@@ -60,7 +51,7 @@ def flow(
     """
     times, s = increasing("t", t), checked("start", start, "... n").copy()
     tol = number("tol", tol, above=0.0)
-    refuse_uncallable("rhs", rhs)
+    need(callable(rhs), "rhs", "a function", rhs)
     path = np.empty((len(times), *s.shape))
     path[0], now, steps = s, float(times[0]), 0
     first = checked("rhs(t, start)", rhs(now, s))
@@ -140,7 +131,7 @@ def transforms_of(
     if callable(transforms):
         return transforms
     known = transforms is None or isinstance(transforms, AuxiliarySpace)
-    refuse_unless(known, "transforms", "an AuxiliarySpace or a function", transforms)
+    need(known, "transforms", "an AuxiliarySpace or a function", transforms)
 
     def jacobians(y: Array) -> tuple[Array, Array]:
         u = np.zeros(plant.n) if plant.constant else equilibrium(plant, y)
