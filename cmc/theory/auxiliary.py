@@ -147,7 +147,8 @@ def decompose(f_y: ArrayLike, f_u: ArrayLike) -> AuxiliarySpace:
 
 def _at_once(f_y: Any, f_u: Any) -> AuxiliarySpace | None:
     """All systems in one compiled call; None where the general road has to say what is wrong."""
-    if not getattr(f_y, "dtype", None) == getattr(f_u, "dtype", None) == np.float64:
+    plain = isinstance(f_y, np.ndarray) and isinstance(f_u, np.ndarray)
+    if not (plain and f_y.dtype == f_u.dtype == np.float64):
         return None
     shape = f_y.shape
     if len(shape) < 2 or shape != f_u.shape or shape[-1] != shape[-2] or not f_y.size:
