@@ -167,6 +167,34 @@ def test_papers_peg_jacobian_has_the_wrong_sign_in_most_samples():
     np.testing.assert_array_equal(np.diagonal(peg.f_y(y, u), 0, -2, -1)[:, 0], -1 / 0.0437)
 
 
+TWO = {"x": [1.0, 2.0], "z": [0.0, -1.0], "u": [[1.0, 0.0], [2.0, -1.0]], "h": 0.01}
+
+
+@pytest.mark.parametrize("bad", [None, "a", 1j, [], np.nan, [np.inf, 1.0], np.ones((2, 3))])
+@pytest.mark.parametrize("name", TWO)
+def test_peg_step_names_what_is_not_finite_or_does_not_fit(name, bad):
+    peg = plants.Peg()
+    assert np.isfinite(peg.step(**TWO)).all()
+    with pytest.raises((TypeError, ValueError), match=rf"\b{name}\b"):
+        peg.step(**TWO | {name: bad})
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: plants.Peg().contact_force(np.ones(2), np.ones(3)), r"x \(2,\), z \(3,\)"),
+        (lambda: plants.Peg().height(np.ones(2), [np.nan, 0.0]), "force needs finite"),
+        (lambda: plants.Peg().surface([1.0, np.inf]), "x needs finite"),
+        (lambda: plants.Peg(tau_x=[0.1, 0.2], K_sur=np.ones(3)), r"tau_x \(2,\).*K_sur \(3,\)"),
+        (lambda: plants.Peg(K_sur=np.ones(3)).surface_slope(np.ones(2)), r"parameters \(3,\)"),
+        (lambda: plants.Peg(K_sur=np.ones(3)).f(np.ones((2, 2)), np.ones(2)), r"y \(2,\), param"),
+    ],
+)
+def test_pegs_and_arguments_that_do_not_fit_are_named(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
+
+
 @pytest.mark.parametrize("bad", [None, "x", 1j, object(), {}, ["a", "b"]])
 @pytest.mark.parametrize(
     ("name", "call"),

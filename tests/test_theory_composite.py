@@ -151,7 +151,7 @@ ONE = Bounds([[1.0, 1.0]], [[2.0, 2.0]])
         (lambda: composite(1.0, [5.0, 5.0]).y([1.0, 2.0, 3.0], 0.0), "fit together.*K1"),
         (lambda: certify_latent(3.0, ONE, 1.0, 5.0), r"signal needs slope_bounds\(\)"),
         (lambda: certify_latent(ONE, Bounds([[1.0]], [[1.0]]), 1.0, 5.0), "policy.slope_bounds"),
-        (lambda: certify_latent(ONE, ONE, [1.0, 2.0], 5.0), "need shape"),
+        (lambda: certify_latent(ONE, ONE, [1.0, 2.0], 5.0), r"K_p needs a number or shape \(1,\)"),
         (lambda: certify_latent(ONE, ONE, 1.0, 5.0, 0.0), "lambda_d needs positive"),
         (lambda: certify_latent(ONE, ONE, 1.0, 5.0, h=0.0), "h needs positive"),
     ],

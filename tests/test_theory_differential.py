@@ -2,9 +2,18 @@
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 from cmc.theory.auxiliary import AuxiliarySpace, decompose
-from cmc.theory.contraction import F2, F, Theta_M, blocks, subsystems, theorem2_margin
+from cmc.theory.contraction import (
+    F2,
+    F,
+    Theta_M,
+    blocks,
+    subsystems,
+    theorem1_margin,
+    theorem2_margin,
+)
 
 SLOPES = np.array([[-1.5, -0.8], [-0.4, -2.0]])
 
@@ -81,6 +90,18 @@ def test_F_is_the_frozen_one_plus_F2_and_its_rows_are_tied_by_the_policy():
     upper = slopes[..., :1] * rate[:, :3] + slopes[..., 1:] * d[:, :3]
     np.testing.assert_allclose(rate[:, 3:], upper, atol=1e-12)
     assert np.abs(F2(space, slopes, 0.0 * T_y_dot)).max() == 0.0
+
+
+def test_theorem_1_bounds_how_fast_distances_grow_and_is_met_where_the_frame_is_still():
+    space, rng = random_space(50)
+    slopes, T_y_dot = rng.normal(size=(50, 2, 2)), rng.normal(size=(50, 2, 2))
+    for moving in (None, T_y_dot):
+        margin = theorem1_margin(space, slopes, moving)
+        for t in (0.01, 0.3):
+            grown = np.linalg.norm(expm(t * F(space, slopes, moving)), 2, axis=(-2, -1))
+            assert (grown <= np.exp(-margin * t) * (1 + 1e-9)).all()
+    soon = np.linalg.norm(expm(1e-6 * F(space, slopes)), 2, axis=(-2, -1))
+    np.testing.assert_allclose(np.log(soon) / 1e-6, -theorem1_margin(space, slopes), rtol=1e-3)
 
 
 def test_frozen_F_is_similar_to_the_closed_loop_in_the_original_coordinates():

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import Array, checked, not_square, refuse_uncallable, together
+from cmc.theory.arrays import Array, checked, filled, need, not_square, together
 from cmc.theory.auxiliary import AuxiliarySpace, decompose
-from cmc.theory.identification import complex_step, differences, jacobian_fault
-from cmc.theory.simulate import equilibrium
+from cmc.theory.identification import complex_step, differences, equilibrium, jacobian_fault
 
 Function = Callable[..., Any]
 Box = tuple[ArrayLike, ArrayLike]
@@ -69,8 +68,8 @@ class Plant(ABC):
                 called point by point.
             y: Smallest and largest latent signal of interest, (n,) each.
             u: Smallest and largest command, numbers or (n,) each.
-            f_y: Its Jacobian in y, arguments as of `f`, (n, n) or (n, n, N); by a complex step
-                where f allows it, else by central differences.
+            f_y: Its Jacobian in y at single vectors, and the time if it takes that, (n, n); by a
+                complex step where f allows it, else by central differences.
             f_u: Its Jacobian in u, likewise.
             name: For messages.
             state_names: One name per latent signal.
@@ -91,7 +90,7 @@ class Plant(ABC):
         """Jacobian of `f` in the command, (..., n, n)."""
 
     def hold(self, y: ArrayLike, t: float = 0.0) -> Array:
-        """Command that holds the plant still at `y`; see `cmc.theory.simulate.equilibrium`."""
+        """Command that holds the plant still at `y`; see `cmc.theory.identification.equilibrium`."""
         return equilibrium(self, y, t)
 
     def space(self, y: ArrayLike = 0.0, u: ArrayLike = 0.0) -> AuxiliarySpace:
@@ -151,44 +150,30 @@ class LinearPlant(Plant):
 class FunctionPlant(Plant):
     """A plant that `Plant.from_function` made; `how` says where its Jacobians come from."""
 
-    def __init__(
-        self,
-        f: Function,
-        y: Box,
-        u: Box,
-        jacobians: tuple[Function | None, Function | None],
-        name: str,
-        state_names: Sequence[str] | None,
-        units: Sequence[str] | None,
-    ) -> None:
+    def __init__(self, f: Any, y: Any, u: Any, own: Any, name: Any, words: Any, units: Any) -> None:
         if not all(isinstance(box, (list, tuple, np.ndarray)) and len(box) == 2 for box in (y, u)):
             raise ValueError(f"y and u each need (low, high), got y = {y!r}, u = {u!r}")
-        if not isinstance(name, str):
-            raise TypeError(f"name needs a string, got {name!r:.60}")
-        for word, given in zip(("f", "f_y", "f_u"), (f, *jacobians), strict=True):
-            if word == "f" or given is not None:
-                refuse_uncallable(word, given)
+        need(isinstance(name, str), "name", "a string", name)
+        need(callable(f), "f", "a function", f)
+        for word, given in zip(("f_y", "f_u"), own, strict=True):
+            need(given is None or callable(given), word, "a function", given)
         self.y_low = checked("y[0]", y[0], "n").copy()
         self.name, self.n = name, len(self.y_low)
         self.y_high = checked("y[1]", y[1], "n", n=self.n).copy()
         m = max([np.size(end) for end in u if np.ndim(end) == 1] or [self.n])
         if m != self.n:
             raise ValueError(not_square(self.n, m))
-        self.u_low, self.u_high = (
-            np.zeros(m) + checked(f"u[{k}]", end, "m" if np.ndim(end) else "", m=m)
-            for k, end in enumerate(u)
-        )
+        self.u_low, self.u_high = (filled(f"u[{k}]", end, m) for k, end in enumerate(u))
         if (self.y_low >= self.y_high).any() or (self.u_low >= self.u_high).any():
             raise ValueError("y and u each need (low, high) with low < high")
-        self.state_names = _words("state_names", state_names, [f"y{i + 1}" for i in range(self.n)])
+        self.state_names = _words("state_names", words, [f"y{i + 1}" for i in range(self.n)])
         self.units = _words("units", units, ["1"] * self.n)
-        self._f, self._own = f, jacobians
-        self._timed = _takes_time(f)
+        self._f, self._own, self._timed = f, own, _takes_time(f)
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             self._batched = self._batches()
             self.how = "given"
-            if None in jacobians:
+            if None in own:
                 self.how = "complex step"
                 if self._fault():
                     self.how = "central differences"
@@ -222,9 +207,9 @@ class FunctionPlant(Plant):
         if (given := self._own[which]) is not None:
             return self._given(given, y, u, t)
         other = pair[1 - which][..., None, :]
+        kind = complex if self.how == "complex step" else float
 
         def along(x: Any) -> Any:
-            kind = complex if self.how == "complex step" else float
             a, b = (x, other) if which == 0 else (other, x)
             return self._rows(a, b, t, kind)
 
@@ -262,18 +247,17 @@ class FunctionPlant(Plant):
         points = np.random.default_rng(0).uniform(size=(2, 3, self.n))
         y = self.y_low + points[0] * (self.y_high - self.y_low)
         u = self.u_low + points[1] * (self.u_high - self.u_low)
-        results, single = [], False
+        found: dict[bool, Any] = {}
         for self._batched in (False, True):
             try:
-                results.append(self._rows(y, u, 0.0, float))
-                single = single or not self._batched
+                found[self._batched] = self._rows(y, u, 0.0, float)
             except (TypeError, ValueError, IndexError):
-                if self._batched and not results:
+                if self._batched and not found:
                     raise
         # `A @ y + b` with a column b works on batches alone, `math.sin(y[0])` on points alone
-        if len(results) == 2:
-            return bool(np.allclose(results[0], results[1], rtol=1e-9))
-        return not single
+        if len(found) == 2:
+            return bool(np.allclose(found[False], found[True], rtol=1e-9))
+        return True in found
 
     def _is_affine(self) -> bool:
         """Whether f is affine and free of time, on points of the boxes and far beyond them."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmc.plants.base import Plant
-from cmc.theory.arrays import Array, checked, not_overflown, number
+from cmc.theory.arrays import Array, checked, not_overflown, number, together
 
 
 class Peg(Plant):
@@ -41,6 +41,8 @@ class Peg(Plant):
         self.K_sur = checked("K_sur", K_sur, above=0.0).copy()
         self.surface_sin = checked("surface_sin", surface_sin).copy()
         self.surface_cos = checked("surface_cos", surface_cos).copy()
+        names = ("tau_x", "tau_z", "K_sur", "surface_sin", "surface_cos")
+        self._batch = together(**{name: getattr(self, name) for name in names})[0]
         steepest = self.K_sur * (self.z_range[0] - np.hypot(self.surface_sin, self.surface_cos))
         not_overflown("K_sur and the surface", steepest)
         self.y_low = np.array([self.x_range[0], float(np.min(steepest, initial=0.0))])
@@ -50,30 +52,49 @@ class Peg(Plant):
 
     def surface(self, x: ArrayLike) -> Array:
         """Height of the surface g(x)."""
-        x = checked("x", x, finite=False)
-        return self.surface_sin * np.sin(x) + self.surface_cos * np.cos(x)
+        return self._g(*self._fitting(x=x))
 
     def surface_slope(self, x: ArrayLike) -> Array:
         """Slope of the surface g'(x)."""
-        x = checked("x", x, finite=False)
-        return self.surface_sin * np.cos(x) - self.surface_cos * np.sin(x)
+        return self._g_slope(*self._fitting(x=x))
 
     def contact_force(self, x: ArrayLike, z: ArrayLike) -> Array:
         """Force of the surface on the peg, K_sur min(z - g(x), 0): never positive."""
-        return self.K_sur * np.minimum(checked("z", z, finite=False) - self.surface(x), 0.0)
+        x, z = self._fitting(x=x, z=z)
+        return self.K_sur * np.minimum(z - self._g(x), 0.0)
 
     def height(self, x: ArrayLike, force: ArrayLike) -> Array:
         """Height z that gives `force` in contact: z = force / K_sur + g(x)."""
-        return checked("force", force, finite=False) / self.K_sur + self.surface(x)
+        x, force = self._fitting(x=x, force=force)
+        return force / self.K_sur + self._g(x)
+
+    def _g(self, x: Array) -> Array:
+        return self.surface_sin * np.sin(x) + self.surface_cos * np.cos(x)
+
+    def _g_slope(self, x: Array) -> Array:
+        return self.surface_sin * np.cos(x) - self.surface_cos * np.sin(x)
+
+    def _fitting(self, **given: ArrayLike) -> list[Array]:
+        """Arguments as finite arrays that fit one another and the parameters, or an error."""
+        arrays = {name: checked(name, value) for name, value in given.items()}
+        if len({self._batch.shape, *(array.shape for array in arrays.values())} - {()}) > 1:
+            together(**arrays, parameters=self._batch)
+        return list(arrays.values())
+
+    def _pair(self, y: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
+        y, u = super()._pair(y, u)
+        if self._batch.ndim:
+            together(y=y[..., 0], parameters=self._batch)
+        return y, u
 
     def step(self, x: ArrayLike, z: ArrayLike, u: ArrayLike, h: float) -> tuple[Array, Array]:
         """Positions after `h` seconds under a held command: exact, since both lags are linear.
 
         x and z are (...), u = (u_x, u_z) is (..., 2); returns the new x and z, each (...).
         """
-        h, u = number("h", h, above=0.0), checked("u", u, "... 2", finite=False)
-        x, z = checked("x", x, finite=False), checked("z", z, finite=False)
-        x_new = u[..., 0] + (x - u[..., 0]) * np.exp(-h / self.tau_x)
+        h, u = number("h", h, above=0.0), checked("u", u, "... 2")
+        x, z, u_x = self._fitting(x=x, z=z, u_x=u[..., 0])
+        x_new = u_x + (x - u_x) * np.exp(-h / self.tau_x)
         z_new = u[..., 1] + (z - u[..., 1]) * np.exp(-h / self.tau_z)
         return x_new, z_new
 
@@ -82,8 +103,8 @@ class Peg(Plant):
         y, u = self._pair(y, u)
         x, force = y[..., 0], y[..., 1]
         x_dot = (u[..., 0] - x) / self.tau_x
-        z_dot = (u[..., 1] - self.height(x, force)) / self.tau_z
-        force_dot = self.K_sur * (z_dot - self.surface_slope(x) * x_dot)
+        z_dot = (u[..., 1] - (force / self.K_sur + self._g(x))) / self.tau_z
+        force_dot = self.K_sur * (z_dot - self._g_slope(x) * x_dot)
         return np.stack(np.broadcast_arrays(x_dot, force_dot), axis=-1)
 
     def f_y(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> Array:
@@ -93,9 +114,8 @@ class Peg(Plant):
         `f_y_paper` keeps that form for comparison.
         """
         y, u = self._pair(y, u)
-        x, slope = y[..., 0], self.surface_slope(y[..., 0])
-        # g'' = -g for this surface
-        bend = -self.surface(x)
+        x, slope = y[..., 0], self._g_slope(y[..., 0])
+        bend = -self._g(x)  # g'' = -g for this surface
         lower = self.K_sur * ((bend * (x - u[..., 0]) + slope) / self.tau_x - slope / self.tau_z)
         return _lower_triangular(-1 / self.tau_x, lower, -1 / self.tau_z)
 
@@ -109,7 +129,7 @@ class Peg(Plant):
     def f_u(self, y: ArrayLike, u: ArrayLike, t: float = 0.0) -> Array:
         """Jacobian in (u_x, u_z) in contact, lower triangular, (..., 2, 2)."""
         y, u = self._pair(y, u)
-        lower = -self.K_sur * self.surface_slope(y[..., 0]) / self.tau_x
+        lower = -self.K_sur * self._g_slope(y[..., 0]) / self.tau_x
         return _lower_triangular(1 / self.tau_x, lower, self.K_sur / self.tau_z)
 
 

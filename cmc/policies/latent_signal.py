@@ -20,13 +20,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from cmc.policies.networks import PositiveNetwork
-from cmc.theory.arrays import checked, count, number, refuse_uncallable
-
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array, checked, count, need, number
 
 
 class LatentSignal(PositiveNetwork):
@@ -84,7 +82,7 @@ class Trial:
         number("effort", self.effort, least=0.0)
         number("duration", self.duration, above=0.0)
         count("steps", self.steps, 100_000)
-        refuse_uncallable("priced", self.priced)
+        need(callable(self.priced), "priced", "a function", self.priced)
 
     def cost(self, act: Callable[[Tensor, Tensor, int], Tensor]) -> Tensor:
         """The cost of p = act(e, e', k) at step k."""
@@ -127,11 +125,9 @@ def improve(
     s = (y, int y), (..., n, 2), to (..., n); `gains` are K_p and K_d, `updates` Adam's, of step
     `rate`. Returns the cost before each update, and after the last.
     """
-    refuse_uncallable("signal", signal)
-    if not isinstance(policy, nn.Module) or not isinstance(trial, Trial):
-        raise TypeError(
-            f"policy needs a torch module and trial a Trial, got {policy!r:.60}, {trial!r:.60}"
-        )
+    need(callable(signal), "signal", "a function", signal)
+    need(isinstance(policy, nn.Module), "policy", "a torch module", policy)
+    need(isinstance(trial, Trial), "trial", "a Trial", trial)
     checked("gains", gains, "2")
     updates, rate = count("updates", updates), number("rate", rate, above=0.0)
     parts = [part for part in (signal, policy) if isinstance(part, nn.Module)]

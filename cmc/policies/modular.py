@@ -13,9 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
 from cmc.policies.stacked import SignalNetwork, check_tensor, tanh
-from cmc.theory.arrays import checked
+from cmc.theory.arrays import Array, checked, filled, need
 
-Array = NDArray[np.float64]
 Real = NDArray[np.floating]
 Function = Callable[[Real], Real]
 
@@ -56,12 +55,12 @@ class ModularPolicy(nn.Module):
         squash: bool = False,
     ) -> None:
         super().__init__()
-        _check_module("network", network, "n")
+        _check_network(network)
         self.network, self.normalise, self.integral = network, normalise, integral
         self.squash = squash
         self.n = int(network.n)  # type: ignore[arg-type]
-        if not (layout is None or isinstance(layout, Mapping)):
-            raise TypeError(f"layout needs a mapping of names to slices, got {layout!r:.60}")
+        fits = layout is None or isinstance(layout, Mapping)
+        need(fits, "layout", "a mapping of names to slices", layout)
         self.layout = {"s": slice(0, 2 * self.n)} if layout is None else dict(layout)
         parts = self.layout.values()
         signals = set(self.layout) - {"R", "T_a"} if all(isinstance(p, slice) for p in parts) else 0
@@ -71,8 +70,9 @@ class ModularPolicy(nn.Module):
                 f"got {self.layout}"
             )
         dtype = _dtype(network)
-        self.register_buffer("u0", _vector("u0", u0, self.n, dtype), persistent=False)
-        self.register_buffer("R", _vector("R", R, self.n, dtype), persistent=False)
+        for name, value in (("u0", u0), ("R", R)):
+            vector = torch.as_tensor(filled(name, value, self.n), dtype=dtype)
+            self.register_buffer(name, vector, persistent=False)
         if not bool((self.R != 0).all()):
             raise ValueError(f"R needs a diagonal without zeros, got {R!r:.60}")
 
@@ -150,12 +150,12 @@ class DirectPolicy(nn.Module):
         squash: bool = False,
     ) -> None:
         super().__init__()
-        _check_module("network", network, "n")
-        if not isinstance(part, slice):
-            raise TypeError(f"part needs a slice of the observation, got {part!r:.60}")
+        _check_network(network)
+        need(isinstance(part, slice), "part", "a slice of the observation", part)
         self.network, self.part, self.squash = network, part, squash
         self.n = int(network.n)  # type: ignore[arg-type]
-        self.register_buffer("u0", _vector("u0", u0, self.n, _dtype(network)), persistent=False)
+        centre = torch.as_tensor(filled("u0", u0, self.n), dtype=_dtype(network))
+        self.register_buffer("u0", centre, persistent=False)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the command (..., n) for an observation (..., d)."""
@@ -171,21 +171,13 @@ class DirectPolicy(nn.Module):
         return self.network(self.signals(observation))
 
 
-def _check_module(name: str, module: Any, *attributes: str) -> None:
-    if not isinstance(module, nn.Module) or not all(hasattr(module, a) for a in attributes):
-        wish = f" with {attributes[0]}" if attributes else ""
-        raise TypeError(f"{name} needs a torch module{wish}, got {module!r:.60}")
+def _check_network(network: Any) -> None:
+    fits = isinstance(network, nn.Module) and hasattr(network, "n")
+    need(fits, "network", "a torch module with n", network)
 
 
 def _dtype(module: nn.Module) -> torch.dtype:
     return next(chain(module.parameters(), module.buffers())).dtype
-
-
-def _vector(name: str, value: ArrayLike, n: int, dtype: torch.dtype) -> Tensor:
-    array = checked(name, value)
-    if array.shape not in ((), (1,), (n,)):
-        raise ValueError(f"{name} needs a number or shape ({n},), got shape {array.shape}")
-    return torch.as_tensor(np.broadcast_to(array, (n,)).copy(), dtype=dtype)
 
 
 def as_numpy(policy: nn.Module) -> Function:
@@ -195,25 +187,20 @@ def as_numpy(policy: nn.Module) -> Function:
     observation that is not finite. Stacked tanh networks run in numpy, which for the few rows of a
     control step costs a fifth of a call into torch; any other policy runs in torch.
     """
-    _check_module("policy", policy)
+    need(isinstance(policy, nn.Module), "policy", "a torch module", policy)
     if any(part.device.type != "cpu" for part in chain(policy.parameters(), policy.buffers())):
         policy = copy.deepcopy(policy).cpu()
     dtype = torch.empty(0, dtype=_dtype(policy)).numpy().dtype
-    run = _in_numpy(policy) or _in_torch(policy)
+    run = _in_numpy(policy)
 
     def act(observation: Real) -> Real:
-        found = checked("observation", observation, "... d")
-        return run(found.astype(dtype, copy=False))
+        found = checked("observation", observation, "... d").astype(dtype, copy=False)
+        if run is not None:
+            return run(found)
+        with torch.inference_mode():
+            return policy(torch.from_numpy(found)).numpy()
 
     return act
-
-
-def _in_torch(policy: nn.Module) -> Function:
-    def run(observation: Real) -> Real:
-        with torch.inference_mode():
-            return policy(torch.from_numpy(observation)).numpy()
-
-    return run
 
 
 def _in_numpy(policy: nn.Module) -> Function | None:

@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
 from cmc.policies.stacked import SignalNetwork, StackedMLP, check_seeds, check_signals
-from cmc.theory.arrays import checked, count
-
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array, checked, count, filled
 
 
 class NegativeWeightError(ValueError):
@@ -58,25 +56,23 @@ class PositiveNetwork(SignalNetwork):
         joint_cap: tuple[ArrayLike, ArrayLike] | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        sizes: dict[str, Any] = {
-            "copies": count("n", n),
-            "seeds": seeds,
-            "bias": bias,
-            "dtype": dtype,
-        }
-        super().__init__(n, StackedMLP(2, 1, hidden, start="positive", **sizes))
-        low = _bound("slope_min", slope_min, (n, 2))
+        n = count("n", n)
+        mlp = StackedMLP(
+            2, 1, hidden, copies=n, seeds=seeds, bias=bias, start="positive", dtype=dtype
+        )
+        super().__init__(n, mlp)
+        low = filled("slope_min", slope_min, n, 2, least=0.0)
         room = joint = None
         if slope_max is not None:
-            high = _bound("slope_max", slope_max, (n, 2))
+            high = filled("slope_max", slope_max, n, 2, least=0.0)
             if not (high > low).all():
                 raise ValueError(f"slope_max needs values above slope_min; got {high} and {low}")
             room = high - low
         if joint_cap is not None:
             if not isinstance(joint_cap, (list, tuple)) or len(joint_cap) != 2:
                 raise ValueError(f"joint_cap needs a pair (weights, limit), got {joint_cap!r:.60}")
-            weight = _bound("joint_cap weights", joint_cap[0], (n, 2))
-            limit = _bound("joint_cap limit", joint_cap[1], (n,))
+            weight = filled("joint_cap weights", joint_cap[0], n, 2, least=0.0)
+            limit = filled("joint_cap limit", joint_cap[1], n, least=0.0)
             left = limit - (weight * low).sum(-1)
             if not ((left > 0).all() and (weight.sum(-1) > 0).all()):
                 raise ValueError(
@@ -166,14 +162,6 @@ def _product(weights: Sequence[Tensor]) -> Tensor:
     for weight in weights[-2::-1]:
         product = weight @ product
     return product[..., 0]
-
-
-def _bound(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = checked(name, value, least=0.0)
-    try:
-        return np.broadcast_to(array, shape).copy()
-    except ValueError:
-        raise ValueError(f"{name} needs shape {shape}, got {array.shape}") from None
 
 
 def _export_positive(module: nn.Module, state: dict[str, Any], prefix: str, *_rest: Any) -> None:

@@ -7,20 +7,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from cmc.policies.stacked import (
     SignalNetwork,
     StackedMLP,
+    as_parameter,
     check_seeds,
     check_signals,
     check_tensor,
     tanh,
 )
-from cmc.theory.arrays import count, number
-
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array, count, number
 
 
 class IndependentNetwork(SignalNetwork):
@@ -114,14 +112,13 @@ class ConvexGradientNetwork(nn.Module):
         self.n, self.mu = n, mu
         checked = check_seeds(seeds)
         self.seeds = None if checked is None else len(checked)
-        parts: list[list[Array]] = [[], [], []]
+        W, a, b = [], [], []
         for seed in checked or (0,):
             rng = np.random.default_rng([seed, n, hidden])
-            parts[0].append(rng.standard_normal((2, n, hidden)) / np.sqrt(n))
-            parts[1].append(rng.uniform(0.0, 2.0, (2, 1, hidden)) / hidden)
-            parts[2].append(rng.uniform(-1.0, 1.0, (2, 1, hidden)))
-        W, a, b = (torch.as_tensor(np.concatenate(part), dtype=dtype) for part in parts)
-        self.W, self.a, self.b = nn.Parameter(W), nn.Parameter(a), nn.Parameter(b)
+            W.append(rng.standard_normal((2, n, hidden)) / np.sqrt(n))
+            a.append(rng.uniform(0.0, 2.0, (2, 1, hidden)) / hidden)
+            b.append(rng.uniform(-1.0, 1.0, (2, 1, hidden)))
+        self.W, self.a, self.b = (as_parameter(part, dtype) for part in (W, a, b))
 
     def _stacked(self, s: Tensor) -> Tensor:
         """Move s ([seeds,] ..., n, 2) to (seeds * 2, batch, n): one row for each term."""

@@ -26,13 +26,6 @@ def check_seeds(seeds: Sequence[int] | None) -> tuple[int, ...] | None:
     return tuple(int(seed) for seed in found)
 
 
-def check_hidden(hidden: Sequence[int]) -> tuple[int, ...]:
-    """Sizes of the hidden layers, at least one."""
-    if not isinstance(hidden, (list, tuple)) or not hidden:
-        raise ValueError(f"hidden needs a size for each layer, at least one; got {hidden!r:.60}")
-    return tuple(count("hidden", size) for size in hidden)
-
-
 def check_tensor(name: str, value: Any, *tail: int) -> None:
     """Refuse what is no tensor of floats of shape (..., *tail)."""
     if not isinstance(value, Tensor) or not value.is_floating_point():
@@ -73,7 +66,10 @@ class StackedMLP(nn.Module):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         super().__init__()
-        sizes = (count("inputs", inputs), *check_hidden(hidden), count("outputs", outputs))
+        if not isinstance(hidden, (list, tuple)) or not hidden:
+            raise ValueError(f"hidden needs a list of sizes, at least one; got {hidden!r:.60}")
+        inner = [count("hidden", size) for size in hidden]
+        sizes = [count("inputs", inputs), *inner, count("outputs", outputs)]
         copies, last = count("copies", copies), number("last", last)
         if not (isinstance(bias, bool) and isinstance(start, str) and start in get_args(Start)):
             raise ValueError(
@@ -93,10 +89,10 @@ class StackedMLP(nn.Module):
                     drawn = rng.standard_normal(shape) / np.sqrt(fan_in)
                 weight.append((last if final else 1.0) * drawn)
                 shift.append(rng.uniform(-1.0, 1.0, (copies, 1, fan_out)))
-            self.weights.append(_parameter(weight, dtype))
+            self.weights.append(as_parameter(weight, dtype))
             if bias:
                 still = final or start == "signed"
-                self.biases.append(_parameter(0.0 * np.array(shift) if still else shift, dtype))
+                self.biases.append(as_parameter(0.0 * np.array(shift) if still else shift, dtype))
 
     @property
     def stack(self) -> int:
@@ -181,7 +177,8 @@ class _Network(torch.autograd.Function):
         return slope if wanted[0] else None, None, *to_weights, *to_biases
 
 
-def _parameter(rows: Any, dtype: torch.dtype) -> nn.Parameter:
+def as_parameter(rows: Any, dtype: torch.dtype) -> nn.Parameter:
+    """One parameter of arrays, seed after seed."""
     return nn.Parameter(torch.as_tensor(np.concatenate(rows), dtype=dtype))
 
 

@@ -30,7 +30,7 @@ def checked(
         shape: Axes by name or size, such as "... n n" or "time 2"; "..." is any batch, "" a number.
         least: Smallest value allowed.
         above: Every value is larger than this.
-        finite: Whether NaN and infinity are refused.
+        finite: Whether infinity is refused, and NaN; where there are bounds NaN always is.
         **sizes: Sizes of named axes; a name without a size takes the first that comes, at least 1.
 
     Raises:
@@ -57,26 +57,37 @@ def checked(
         comma = "," if len(axes) == 1 and not batch else ""
         wish = f"shape ({words}{comma})" if axes else "a single number"
         raise ValueError(f"{name} needs {wish}, got shape {found}")
-    if not finite:
+    if least is above is None and (not finite or np.isfinite(array).all()):
         return array
-    bad, wish = ~np.isfinite(array), "finite values"
+    bad, wish = finite & ~np.isfinite(array), "finite values"
     if least is not None and not bad.any():
-        bad, wish = array < least, f"values of at least {least:g}"
+        bad, wish = ~(array >= least), f"values of at least {least:g}"
     if above is not None and not bad.any():
-        bad = array <= above
+        bad = ~(array > above)
         wish = "positive values" if above == 0 else f"values above {above:g}"
     if bad.any():
-        index = tuple(int(i) for i in np.argwhere(bad)[0])
-        where = f" at index {index[0] if len(index) == 1 else index}" if index else ""
-        raise ValueError(f"{name} needs {wish}, got {array[index]}{where}")
+        raise ValueError(f"{name} needs {wish}, got {array[bad][0]}{first_index(bad)}")
     return array
 
 
-def number(
-    name: str, value: ArrayLike, *, least: float | None = None, above: float | None = None
-) -> float:
-    """Return `value` as one finite number, as `checked` does."""
-    return float(checked(name, value, "", least=least, above=above))
+def first_index(bad: NDArray[np.bool_]) -> str:
+    """Where the first True of an array stands, as a clause; "" in a single number."""
+    index = tuple(int(i) for i in np.argwhere(bad)[0])
+    return f" at index {index[0] if len(index) == 1 else index}" if index else ""
+
+
+def number(name: str, value: ArrayLike, **bounds: Any) -> float:
+    """Return `value` as one finite number; bounds as in `checked`."""
+    return float(checked(name, value, "", **bounds))
+
+
+def filled(name: str, value: ArrayLike, *shape: int, **bounds: Any) -> Array:
+    """Return `value`, a number or what broadcasts, as a new array of a shape; see `checked`."""
+    array = checked(name, value, **bounds)
+    try:
+        return np.broadcast_to(array, shape).copy()
+    except ValueError:
+        raise ValueError(f"{name} needs a number or shape {shape}, got {array.shape}") from None
 
 
 def count(name: str, value: float, most: int = 1_000_000) -> int:
@@ -89,8 +100,13 @@ def count(name: str, value: float, most: int = 1_000_000) -> int:
 
 def refuse_uncallable(name: str, value: Any) -> None:
     """Raise a TypeError where `value` cannot be called."""
-    if not callable(value):
-        raise TypeError(f"{name} needs a function, got {_short(value)}")
+    need(callable(value), name, "a function", value)
+
+
+def need(fits: bool, name: str, wish: str, value: Any) -> None:
+    """Raise a TypeError where `value` is not of the kind that was wished for."""
+    if not fits:
+        raise TypeError(f"{name} needs {wish}, got {_short(value)}")
 
 
 def increasing(name: str, value: ArrayLike, least: int = 2) -> Array:

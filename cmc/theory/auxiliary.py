@@ -94,16 +94,20 @@ class AuxiliarySpace:
         sizes = together(k1=checked("k1", k1), k2=checked("k2", k2), R_ii=self.gains)[:2]
         return -np.sign(self.gains)[..., None] * np.stack(sizes, axis=-1)  # constraint_sign
 
-    def loop(self, slopes: ArrayLike) -> Array:
+    def loop(self, slopes: ArrayLike, h: float | None = None) -> Array:
         """Jacobian of the loop in (z, int z) [1/s] for signed slopes (..., n, 2): (..., 2n, 2n).
 
-        [[Lambda + R P, R Q], [I, 0]], P and Q the diagonal matrices of the slopes.
+        [[Lambda + R P, R Q], [I, 0]], P and Q the diagonal matrices of the slopes. With `h` (s),
+        where Lambda and R are those of a sample, the step in (z_k, I_{k-1}), I_k = I_{k-1} + h z_k:
+        [[Lambda + R (P + h Q), R Q], [h I, I]].
         """
         s, n = checked("slopes", slopes, "... n 2", n=self.n), self.n
         P, Q = s[..., None, :, 0], s[..., None, :, 1]
+        P = P if h is None else P + h * Q
         top = np.concatenate(together(slopes=self.Lambda + self.R * P, R=self.R * Q), axis=-1)
         J = np.zeros((*top.shape[:-2], 2 * n, 2 * n))
-        J[..., :n, :], J[..., n:, :n] = top, np.eye(n)
+        J[..., :n, :], J[..., n:, :n] = top, np.eye(n) * (1.0 if h is None else h)
+        J[..., n:, n:] = np.eye(n) * (h is not None)
         not_overflown("slopes", J)
         return J
 
@@ -143,14 +147,11 @@ def decompose(f_y: ArrayLike, f_u: ArrayLike) -> AuxiliarySpace:
 
 def _at_once(f_y: Any, f_u: Any) -> AuxiliarySpace | None:
     """All systems in one compiled call; None where the general road has to say what is wrong."""
-    shape: tuple[int, ...] = getattr(f_y, "shape", ())
-    if (
-        len(shape) < 2
-        or shape != getattr(f_u, "shape", ())
-        or shape[-1] != shape[-2]
-        or not f_y.size
-        or not f_y.dtype == f_u.dtype == np.float64
-    ):
+    plain = isinstance(f_y, np.ndarray) and isinstance(f_u, np.ndarray)
+    if not (plain and f_y.dtype == f_u.dtype == np.float64):
+        return None
+    shape = f_y.shape
+    if len(shape) < 2 or shape != f_u.shape or shape[-1] != shape[-2] or not f_y.size:
         return None
     flat = [np.ascontiguousarray(x).reshape(-1, *shape[-2:]) for x in (f_y, f_u)]
     arrays = np.empty((4, *flat[0].shape))

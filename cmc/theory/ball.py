@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cmc.theory.arrays import Array
-from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.certificates import Certificate
 from cmc.theory.contraction import metric_factor
-from cmc.theory.identification import differences
+from cmc.theory.identification import command_limits, differences, root
 from cmc.theory.simulate import Loop
+from cmc.theory.slopes import BlockLoop
 
 _SAMPLES = 2048
 
@@ -37,61 +37,42 @@ def rest_point(loop: Loop, keep: Array) -> Array | None:
         s[..., keep] = x
         return loop.field(0.0, s)[..., keep]
 
-    x = start[keep]
+    def jacobian(x: Array) -> Array:
+        return differences(residual, x, 1e-6 * (np.abs(x) + 1e-3 * np.abs(x).max() + 1e-6))
+
     try:
-        r = residual(x)
-        first = scale = float(np.linalg.norm(r))
-        for _ in range(60):
-            size = 1e-6 * (np.abs(x) + 1e-3 * np.abs(x).max() + 1e-6)
-            move = -np.linalg.lstsq(differences(residual, x, size), r, rcond=None)[0]
-            length = 1.0
-            while not np.linalg.norm(residual(x + length * move)) < scale and length > 1e-6:
-                length /= 2
-            if length <= 1e-6:
-                break
-            x = x + length * move
-            r = residual(x)
-            scale = float(np.linalg.norm(r))
+        start[keep], lost = root(residual, jacobian, start[keep])
     except (ValueError, TypeError, np.linalg.LinAlgError):
         return None
-    if not scale <= 1e-9 * first + 1e-12:
-        return None
-    start[keep] = x
-    return start
+    return None if lost else start
 
 
 def ball_everywhere(
-    answer: Certificate,
-    policy: Any,
-    plant: Any,
-    space: AuxiliarySpace,
-    slopes: tuple[Array, Array],
-    keep: Array,
-    h: float | None,
-    y_ref: ArrayLike,
+    answer: Certificate, blocks: BlockLoop, policy: Any, plant: Any, y_ref: ArrayLike
 ) -> Certificate:
     """Add the ball to a certificate in (z, int z) that holds for all commands within the limits.
 
     |du_j| <= sum_i |T_a,ji| (|p_i| |dz_i| + |q_i| |dI_i|) over the interval of the slopes, and in a
     ball of radius r each |dx_i| is at most r |row i of Theta^-1|.
     """
-    low, high = _limits(plant)
-    if not (np.isfinite(low).any() or np.isfinite(high).any()):
+    low, high = command_limits(plant)
+    if not np.isfinite([low, high]).any():
         return replace(answer, ball=np.inf)
     caution = "while no command is clipped at the plant's limits"
+    space, keep, h = blocks.space, blocks.keep, blocks.h
     try:
         loop = Loop(plant, policy, space, y_ref)
+        rest = rest_point(loop, keep)
     except (ValueError, TypeError):  # slopes alone say nothing about commands
-        return replace(answer, reason=f"{answer.reason}; {caution}")
-    rest = rest_point(loop, keep)
+        rest = None
     if rest is None:
         return replace(answer, reason=f"{answer.reason}; {caution}")
     n, rows = space.n, np.zeros(2 * space.n)
     rows[keep] = np.linalg.norm(_spread_of(answer), axis=1)
-    size = np.abs(np.stack(slopes)).max(axis=0)
+    size = np.abs([blocks.low, blocks.high]).max(axis=0)
     p = size[:, 0] + (0.0 if h is None else h * size[:, 1])
     speed = np.abs(space.T_a) @ (p * rows[:n] + size[:, 1] * rows[n:])
-    u = loop.signals(rest[:n], rest[n:])[1]
+    u = loop.signals(rest[:n], rest[n:])[-1]
     radius = float((np.minimum(u - low, high - u) / speed).min())
     state = np.concatenate([space.to_z(rest[:n] - loop.y_ref), rest[n:]])[keep]
     return _noted(replace(answer, rest=state), radius, caution)
@@ -104,7 +85,7 @@ def ball_in_box(
     caution, rest = "nothing says that they do", rest_point(loop, keep)
     if rest is None:
         return replace(answer, reason=f"{answer.reason} ({caution}: no point of rest was found)")
-    n, m, spread, limits = loop.n, len(keep), _spread_of(answer), _limits(loop.plant)
+    n, m, spread, limits = loop.n, len(keep), _spread_of(answer), command_limits(loop.plant)
     room = np.minimum(rest - low, high - rest)[keep] / np.linalg.norm(spread, axis=1)
     radius = 0.99 * float(room.min())  # rest itself is not exact
 
@@ -112,9 +93,7 @@ def ball_in_box(
         """How far the commands are from the plant's limits, (N,)."""
         s = np.broadcast_to(rest, (len(x), 2 * n)).copy()
         s[:, keep] += radius * x @ spread.T
-        z, u = loop.signals(s[:, :n], s[:, n:])
-        if h is not None:
-            u = loop.signals(s[:, :n], s[:, n:] + h * z, z=z)[1]
+        u = loop.signals(s[:, :n], s[:, n:], h=h)[-1]
         return np.asarray(np.minimum(u - limits[0], limits[1] - u).min(axis=-1))
 
     start = _in_ball(np.random.default_rng(3).normal(size=(_SAMPLES, m)))
@@ -161,8 +140,3 @@ def _noted(answer: Certificate, radius: float, caution: str) -> Certificate:
         return replace(answer, reason=f"{answer.reason} ({caution}: {why})")
     note = f"no trajectory leaves the ball of radius {radius:.3g} around rest in this metric"
     return replace(answer, ball=radius, reason=f"{answer.reason}; {note}, nor is clipped in it")
-
-
-def _limits(plant: Any) -> tuple[Array, Array]:
-    low, high = getattr(plant, "u_low", -np.inf), getattr(plant, "u_high", np.inf)
-    return tuple(np.broadcast_to(np.asarray(x, dtype=float), (plant.n,)) for x in (low, high))  # type: ignore[return-value]

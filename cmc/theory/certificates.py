@@ -16,18 +16,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import Array, checked, number
+from cmc.theory.arrays import Array, checked, filled, number
 from cmc.theory.contraction import metric_factor, overshoot
 from cmc.theory.metric_search import condition_metric, search_metric
 
 Progress = Callable[[str], object]
 
-# Settling for this share of the largest provable rate keeps the metric well conditioned.
-_SHARE = 0.9
+SHARE = 0.9
+"""Settling for this share of the largest provable rate keeps the metric well conditioned."""
 # So many vertices are searched at once; more join where they turn out to be violated.
 _AT_ONCE, _MORE, _ROUNDS = 40, 12, 12
 _CHUNK = 1024
@@ -44,8 +45,8 @@ class Certificate:
 
     Attributes:
         holds: Whether contraction is shown, as far as `evidence` says.
-        kind: "exact" if the total Jacobian was used, "frozen" if the transforms were held constant
-            where they move: that never holds, because it proves nothing.
+        kind: "exact", of the total Jacobian, or "frozen", with the transforms held constant where
+            they move: that never holds, because it proves nothing.
         domain: "continuous", or "sampled" with a zero-order hold.
         rate: Proved contraction rate, 1/s (NaN where nothing is proved; what each frozen instant
             would have where `kind` is "frozen").
@@ -55,11 +56,9 @@ class Certificate:
         region: Where it holds, in words.
         reason: Why it holds, or does not and what would help, in words.
         refused: Whether the question could not be asked at all.
-        evidence: "proof" if the argument covers the whole region, "points" if the Jacobians were
-            looked at on points of it and nothing is said about those between.
-        ball: Radius, in the metric, of the ball around the point of rest that no trajectory leaves:
-            inside it nothing leaves the box and no command reaches the plant's limits. NaN where
-            none was found; infinite for a plant without limits.
+        evidence: "proof" or "points", as above: nothing is said about what lies between points.
+        ball: Radius, in the metric, of the ball around the point of rest in which no command
+            reaches the plant's limits. NaN where none was found; infinite without limits.
         rest: That point of rest in the metric's coordinates, (m,), or None.
     """
 
@@ -118,13 +117,13 @@ def circle_criterion(c: float, k1: float, k2: float) -> Certificate:
         for _ in range(60):
             beta = (low + high) / 2
             low, high = (beta, high) if meets(*shifted(beta)) else (low, beta)
-        beta = _SHARE * low
+        beta = SHARE * low
         damping, soft, stiff = shifted(beta)
         mixed = damping**2 / 2 + np.sqrt(soft * stiff)
         # (w' + beta w, w) are the coordinates of e^{beta t} w
         shear = np.array([[1.0, beta], [0.0, 1.0]])
         metric = shear.T @ np.array([[1, damping / 2], [damping / 2, mixed]]) @ shear
-        rate = rate_in(corners, metric)
+        rate = float(rates_in(corners, metric).min())
         if rate > 0:
             return Certificate(True, rate=rate, metric=metric, reason="circle criterion")
     if k1 <= 0 or c <= 0:
@@ -136,6 +135,12 @@ def circle_criterion(c: float, k1: float, k2: float) -> Certificate:
         f"{most:.4g}, and reaches {k2:.4g}"
     )
     return Certificate(False, violated=corners[1], reason=reason)
+
+
+def corners(low: Array, high: Array) -> Array:
+    """The corners of an interval of slopes (n, 2), (N, n, 2): one end alone where both agree."""
+    ends = [np.unique(pair) for pair in np.stack([low, high], axis=-1).reshape(-1, 2)]
+    return np.array(list(product(*ends))).reshape(-1, *low.shape)
 
 
 def common_metric(
@@ -198,7 +203,7 @@ def _of_few(vertices: Array, h: float | None) -> tuple[Array | None, float, int]
     high = float(-eigenvalues.real.max())
     if h is not None:
         high = float(-np.log(max(np.abs(eigenvalues).max(), 1e-3)) / h)
-    low = max(rate_in(vertices, metric, h), 0.0)
+    low = max(float(rates_in(vertices, metric, h).min()), 0.0)
     for _ in range(8):
         if high < 1.03 * low:
             break
@@ -207,33 +212,25 @@ def _of_few(vertices: Array, h: float | None) -> tuple[Array | None, float, int]
         if ahead is None:
             high = middle
         else:
-            metric, low = ahead, max(middle, rate_in(vertices, ahead, h))
-    aim = _SHARE * low
+            metric, low = ahead, max(middle, float(rates_in(vertices, ahead, h).min()))
+    aim = SHARE * low
     try:
         return condition_metric(faster(aim), metric, discrete=h is not None), aim, worst
     except (np.linalg.LinAlgError, ValueError):  # too ill conditioned to be improved
         return metric, aim, worst
 
 
-def rate_in(
-    vertices: ArrayLike,
-    metric: ArrayLike,
-    h: float | None = None,
-    slack: ArrayLike | None = None,
-) -> float:
-    """Smallest rate of the vertices in a metric, 1/s; with `h` of the steps of a sampled loop."""
-    return float(rates_in(vertices, metric, h, slack).min())
-
-
 def rates_in(
     vertices: ArrayLike, metric: ArrayLike, h: float | None = None, slack: ArrayLike | None = None
 ) -> Array:
-    """Rates of the vertices (V, m, m) in a metric, lowered by a bound on rounding, (V,), 1/s."""
+    """Rates of the vertices (V, m, m) in a metric, lowered by a bound on rounding, (V,), 1/s.
+
+    With `h` (s) the vertices are the steps of a sampled loop; `slack` as in `common_metric`.
+    """
     theta = metric_factor(metric)
     vertices = checked("vertices", vertices, "V m m", m=len(theta))
     h = None if h is None else number("h", h, above=0.0)
-    n = len(theta)
-    off = np.zeros((n, n)) if slack is None else checked("slack", slack, "n n", n=n, least=0.0)
+    off = filled("slack", 0.0 if slack is None else slack, *theta.shape, least=0.0)
     inverse = np.linalg.inv(theta)
     rates = np.empty(len(vertices))
     for start in range(0, len(vertices), _CHUNK):

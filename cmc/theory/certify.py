@@ -20,25 +20,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import Array, checked, number
+from cmc.theory.arrays import Array, filled, need, number
 from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.ball import ball_everywhere
-from cmc.theory.certificates import Certificate, Progress, common_metric, rate_in
+from cmc.theory.certificates import Certificate, Progress, common_metric, corners, rates_in
 from cmc.theory.combinations import transforms_that_fit
 from cmc.theory.exact import Region, certify_exact, spread
 from cmc.theory.identification import jacobian_fault
 from cmc.theory.metric_search import search_metric
 from cmc.theory.sampled import hold
-from cmc.theory.simulate import transforms_of
+from cmc.theory.simulate import Transforms, transforms_of
 from cmc.theory.slopes import BlockLoop, compose_hierarchical, factor_of, inner, slope_interval
 
-Transforms = Callable[[Array], AuxiliarySpace]
 # Corner matrices of the whole loop are listed up to this many modes, 4^8 = 65536 of them.
 _MOST_MODES = 8
 
@@ -79,17 +77,12 @@ def certify(
     """
     if not (isinstance(kind, str) and kind in ("exact", "frozen")):
         raise ValueError(f"kind needs to be 'exact' or 'frozen', got {kind!r}")
-    if not all(hasattr(plant, name) for name in ("n", "f", "f_y", "f_u", "constant")):
-        raise TypeError(f"plant needs n, f, f_y, f_u and constant, as Plant has; got {plant!r}")
-    if not (region is None or isinstance(region, Region)):
-        raise TypeError(f"region needs a Region or None, got {region!r}")
-    if not (transforms is None or callable(transforms) or hasattr(transforms, "T_y")):
-        raise TypeError(f"transforms needs an AuxiliarySpace or a function, got {transforms!r}")
-    if not (progress is None or callable(progress)):
-        raise TypeError(f"progress needs a function of a line of text, got {progress!r}")
-    y_ref = checked("y_ref", y_ref)
-    if y_ref.shape not in ((), (plant.n,)):
-        raise ValueError(f"y_ref needs one number or ({plant.n},), got shape {y_ref.shape}")
+    fits = all(hasattr(plant, name) for name in ("n", "f", "f_y", "f_u", "constant"))
+    need(fits, "plant", "n, f, f_y, f_u and constant, as Plant has", plant)
+    need(region is None or isinstance(region, Region), "region", "a Region or None", region)
+    fits = progress is None or callable(progress)
+    need(fits, "progress", "a function of a line of text", progress)
+    y_ref = filled("y_ref", y_ref, plant.n)
     h = None if h is None else number("h", h, above=0.0)
     domain = "continuous" if h is None else "sampled"
 
@@ -110,8 +103,7 @@ def certify(
         centre = spaces(np.mean(box.corners, axis=0))
     except (ValueError, np.linalg.LinAlgError) as error:
         return refuse(f"{error}{_instead(plant, transforms)}")
-    if not isinstance(centre, AuxiliarySpace):
-        raise TypeError(f"transforms needs to return an AuxiliarySpace, got {centre!r}")
+    need(isinstance(centre, AuxiliarySpace), "transforms", "to return an AuxiliarySpace", centre)
     if (centre.gains == 0).any():
         return refuse("R has a zero on its diagonal: some action does not move its own signal")
     if callable(transforms) or not plant.constant:
@@ -184,18 +176,18 @@ def _everywhere(
     metric = metric[np.ix_(order, order)]
     reason = "every dimension contracts, joined as a hierarchy"
     if space.n > _MOST_MODES:
-        rate = min(rate, rate_in(loop.matrix(low)[None], metric, h, loop.slack))
+        rate = min(rate, float(rates_in(loop.matrix(low)[None], metric, h, loop.slack)[0]))
     else:
-        corners = loop.corners(range(space.n))
-        found = common_metric(corners, h=h, slack=loop.slack, progress=progress)
-        rate = rate_in(corners, metric, h, loop.slack)
+        whole = loop.corners(range(space.n))
+        found = common_metric(whole, h=h, slack=loop.slack, progress=progress)
+        rate = float(rates_in(whole, metric, h, loop.slack).min())
         if found.holds and found.metric is not None:
             metric, rate = found.metric, found.rate
-            reason = f"one metric for {len(corners)} corners of the slopes"
+            reason = f"one metric for {len(whole)} corners of the slopes"
     if not rate > 0:
         return no("every dimension contracts, but rounding hides whether they do together")
     answer = Certificate(True, domain=domain, rate=rate, metric=metric, reason=reason)
-    return ball_everywhere(answer, policy, plant, space, (low, high), loop.keep, h, y_ref)
+    return ball_everywhere(answer, loop, policy, plant, y_ref)
 
 
 def _help(loop: BlockLoop, block: list[int]) -> str:
@@ -212,8 +204,8 @@ def _help(loop: BlockLoop, block: list[int]) -> str:
         """Whether slopes up to a share of the way from floor to cap, all `times` as large, fit."""
         ends = times * np.stack([floor, floor + share * (cap - floor)])
         tried.low, tried.high = ends.min(axis=0), ends.max(axis=0)
-        corners = tried.corners(block)[:, at[:, None], at]
-        return search_metric(corners, discrete=loop.h is not None)[0] is not None
+        inside = tried.corners(block)[:, at[:, None], at]
+        return search_metric(inside, discrete=loop.h is not None)[0] is not None
 
     def most(test: Callable[[float], bool]) -> float:
         low, high = 0.0, 1.0
@@ -234,7 +226,7 @@ def _help(loop: BlockLoop, block: list[int]) -> str:
 
 def _bound(loop: BlockLoop, i: int) -> str:
     """The bound that slopes of one dimension break whatever the metric, or ""."""
-    h, R, Lambda = loop.h, loop.R[i, i], loop.Lambda[i, i]
+    h, R, Lambda = loop.h, loop.space.R[i, i], loop.space.Lambda[i, i]
     p, q = -R * np.stack([loop.low[i], loop.high[i]]).T  # loop gains, positive where they damp
     size, grows = abs(R), Lambda if h is None else Lambda - 1.0  # per second, or per sample
     if p.min() - grows <= 0 and q.min() >= 0:
@@ -277,16 +269,8 @@ def _frozen(policy: Any, spaces: Transforms, box: Region, h: float | None) -> Ce
             Lambda, R = space.Lambda[k], space.R[k]
             if h is not None:
                 Lambda, R = hold(Lambda, R, h)
-            low, high = slope_interval(policy, space.gains[k])
-            ends = [np.unique(pair) for pair in np.stack([low, high], -1).reshape(-1, 2)]
-            slopes = np.array(list(product(*ends))).reshape(-1, space.n, 2)
             here = replace(space, T_y=space.T_y[k], T_a=space.T_a[k], Lambda=Lambda, R=R)
-            if h is not None:
-                slopes[..., 0] += h * slopes[..., 1]
-            step = here.loop(slopes)
-            if h is not None:
-                step[:, space.n :] = np.hstack([h * np.eye(space.n), np.eye(space.n)])
-            vertices.append(step)
+            vertices.append(here.loop(corners(*slope_interval(policy, space.gains[k])), h))
         found = common_metric(np.concatenate(vertices), h=h)
     except (ValueError, np.linalg.LinAlgError) as error:
         return Certificate(False, "frozen", domain, region=where, reason=str(error), refused=True)

@@ -90,7 +90,7 @@ def feedback(f_y: ArrayLike, f_u: ArrayLike, slopes: ArrayLike | None = None) ->
     T_y, Lambda = real_block_form(f_y)
     T_a, R = np.linalg.inv(T_y @ f_u), np.broadcast_to(np.eye(f_y.shape[-1]), T_y.shape)
     if slopes is not None:
-        R = feedback_gain(Lambda, slopes)
+        R = _block_gain(Lambda, slopes)
         T_a = np.matmul(*together(f_u=T_a, slopes=R))
     not_overflown("f_y and f_u", T_a, R)
     return AuxiliarySpace(*together(T_y=T_y, T_a=T_a, Lambda=Lambda, R=R))
@@ -125,13 +125,8 @@ def real_block_form(f_y: ArrayLike) -> tuple[Array, Array]:
     return np.linalg.inv(basis), Lambda
 
 
-def feedback_gain(Lambda: ArrayLike, slopes: ArrayLike) -> Array:
-    """Return B = `T_y f_u T_a` of the block form, (..., n, n), for `Lambda` from `real_block_form`.
-
-    `B = Pi_1 sym(Lambda) - Pi_2 + skew(Lambda) Pi_1`, that is `b_ii = p_i s - q_i > 0`,
-    `b_12 = p_2 w`, `b_21 = -p_1 w`; slopes (..., n, 2) and real parts are negative.
-    """
-    L = checked("Lambda", Lambda, "... n n")
+def _block_gain(L: Array, slopes: ArrayLike) -> Array:
+    """B = Pi_1 sym(Lambda) - Pi_2 + skew(Lambda) Pi_1 of `feedback`, (..., n, n)."""
     s, eye = checked("slopes", slopes, "... n 2", n=L.shape[-1]), np.eye(L.shape[-1])
     if not (s < 0.0).all():
         raise ValueError(f"slopes must be negative here (R_ii > 0), got a largest of {s.max():.6g}")
@@ -169,24 +164,17 @@ def possible_combinations(f_y: ArrayLike, f_u: ArrayLike) -> tuple[Possibility, 
     real = float(np.linalg.eigvals(f_y).real.max())
     floor = "" if real < 0.0 else f"; |d pi/dz| must exceed {real:.6g} everywhere (slope floor)"
     steady = partial(feedback, slopes=-np.ones((len(f_y), 2)))
-    roads: dict[str, tuple[Callable[..., AuxiliarySpace], str]] = {
-        "hierarchical": (decompose, "f_y has real eigenvectors, so that couplings go one way"),
-        "schur": (schur, "f_y has real eigenvalues, so that a rotation makes it triangular"),
-        "feedback (policies)": (
-            feedback,
-            "T_a = (T_y f_u)^-1 leaves rotations as the only couplings; one metric has to be found "
-            f"for slopes that vary{floor}",
-        ),
-        "feedback (constant slopes)": (
-            steady,
-            "every real part is negative, so that all couplings can be made skew",
-        ),
-        "block schur": (
-            block_schur,
-            f"a rotation leaves single modes and pairs, coupled one way{floor}",
-        ),
-    }
-    return tuple(_try(name, why, build, f_y, f_u) for name, (build, why) in roads.items())
+    turning = "T_a = (T_y f_u)^-1 leaves rotations as the only couplings; one metric has to be"
+    still = "every real part is negative, so that all couplings can be made skew"
+    pairs = "a rotation leaves single modes and pairs, coupled one way"
+    roads: tuple[tuple[str, str, Callable[..., AuxiliarySpace]], ...] = (
+        ("hierarchical", "f_y has real eigenvectors, so that couplings go one way", decompose),
+        ("schur", "f_y has real eigenvalues, so that a rotation makes it triangular", schur),
+        ("feedback (policies)", f"{turning} found for slopes that vary{floor}", feedback),
+        ("feedback (constant slopes)", still, steady),
+        ("block schur", f"{pairs}{floor}", block_schur),
+    )
+    return tuple(_try(*road, f_y, f_u) for road in roads)
 
 
 def _try(name: str, reason: str, build: Callable[..., Any], *args: Any) -> Possibility:

@@ -18,17 +18,15 @@ Wrong shapes, signs and sizes raise ValueError, or TypeError, with the argument'
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from cmc.theory.arrays import Array, checked, not_overflown, number, together
-from cmc.theory.certificates import Certificate, common_metric
+from cmc.theory.arrays import Array, checked, filled, need, not_overflown, number, together
+from cmc.theory.certificates import Certificate, common_metric, corners
 
 Root = Literal["small", "large"]
 
@@ -112,14 +110,9 @@ def composite(
     """
     if not isinstance(root, str) or root not in ("small", "large"):
         raise ValueError(f"root must be 'small' or 'large', got {root!r}")
-    kp, kd, lam = (
-        gain.copy()
-        for gain in together(
-            K_p=checked("K_p", K_p, least=0.0),
-            K_d=checked("K_d", K_d, above=0.0),
-            lambda_d=checked("lambda_d", lambda_d, above=0.0),
-        )
-    )
+    K_p, K_d = checked("K_p", K_p, least=0.0), checked("K_d", K_d, above=0.0)
+    lambda_d = checked("lambda_d", lambda_d, above=0.0)
+    kp, kd, lam = (gain.copy() for gain in together(K_p=K_p, K_d=K_d, lambda_d=lambda_d))
     with np.errstate(all="ignore"):
         square, twin = kd**2, 4.0 * kp * lam
         not_overflown("K_d", square, 1.0 / square)
@@ -170,25 +163,17 @@ def certify_latent(
     low, high = _slopes("signal", signal)
     least, most = _slopes("policy", policy, n=len(low))
     h = None if h is None else number("h", h, above=0.0)
-    gains = together(
-        signal=low[:, 0],
-        K_p=checked("K_p", K_p),
-        K_d=checked("K_d", K_d),
-        lambda_d=checked("lambda_d", lambda_d, above=0.0),
-    )[1:]
-    if gains[0].shape != low[:, 0].shape:
-        raise ValueError(f"K_p, K_d, lambda_d need shape {low[:, 0].shape}, got {gains[0].shape}")
+    n = len(low)
+    K_p, K_d = filled("K_p", K_p, n), filled("K_d", K_d, n)
+    lambda_d = filled("lambda_d", lambda_d, n, above=0.0)
     metrics, rates = [], []
-    for i, (kp, kd, lam) in enumerate(zip(*gains, strict=True)):
-        ends = [
-            np.unique([a[i, m], b[i, m]]) for a, b in ((low, high), (least, most)) for m in (0, 1)
-        ]
-        corners = [
-            _latent_jacobian(kp / lam, kd / lam, phi, (p / lam, q / lam), h)
-            for *phi, p, q in product(*ends)
+    for i, (kp, kd, lam) in enumerate(zip(K_p, K_d, lambda_d, strict=True)):
+        jacobians = [
+            _latent_jacobian(kp / lam, kd / lam, phi, pq / lam, h)
+            for phi, pq in corners(np.stack([low[i], least[i]]), np.stack([high[i], most[i]]))
         ]
         size = 3 if most[i, 1] > 0 else 2
-        axis = common_metric(np.array(corners)[:, :size, :size], h=h)
+        axis = common_metric(np.array(jacobians)[:, :size, :size], h=h)
         if not axis.holds or axis.metric is None:
             return replace(axis, reason=f"axis {i + 1}: {axis.reason}", region="everywhere")
         metrics.append(axis.metric)
@@ -206,20 +191,16 @@ def _slopes(name: str, part: Any, **sizes: Any) -> tuple[Array, Array]:
     """Lower and upper slopes, (n, 2) each."""
     if isinstance(part, CompositeModel):
         bounds = [np.stack([np.atleast_1d(part.K1), np.atleast_1d(part.K2)], axis=-1)] * 2
-    elif hasattr(part, "slope_bounds"):
-        bounds = part.slope_bounds()
     else:
-        raise TypeError(f"{name} needs slope_bounds() -> (lower, upper), got {part!r}")
+        need(hasattr(part, "slope_bounds"), name, "slope_bounds() -> (lower, upper)", part)
+        bounds = part.slope_bounds()
     low, high = (checked(f"{name}.slope_bounds()", bound, "n 2", **sizes) for bound in bounds)
     return low, high
 
 
-def _latent_jacobian(
-    kp: float, kd: float, phi: Sequence[float], pq: tuple[float, float], h: float | None
-) -> Array:
+def _latent_jacobian(kp: float, kd: float, phi: Array, pq: Array, h: float | None) -> Array:
     """Jacobian in (e, e', int y), or with h the step in (e_k, e_k', I_{k-1}), (3, 3)."""
-    a, b = phi
-    p, q = pq
+    (a, b), (p, q) = phi, pq
     if h is None:
         return np.array([[0, 1, 0], [-(kp + p * a), -(kd + p * b), -q], [a, b, 0]], dtype=float)
     p = p + h * q

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_continuous_lyapunov
 
-from cmc.theory.arrays import Array, checked, inverse, not_overflown, number, together
+from cmc.theory.arrays import Array, checked, inverse, need, not_overflown, number, together
 from cmc.theory.auxiliary import AuxiliarySpace
 
 
@@ -150,9 +150,7 @@ def overshoot(metric: ArrayLike) -> Array:
 
 
 def _asked(space: AuxiliarySpace) -> None:
-    """Refuse what is no space, where a margin is asked for."""
-    if not isinstance(space, AuxiliarySpace):
-        raise TypeError(f"space needs an AuxiliarySpace, got {type(space).__name__}")
+    need(isinstance(space, AuxiliarySpace), "space", "an AuxiliarySpace", space)
 
 
 def theorem1_margin(

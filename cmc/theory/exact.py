@@ -10,7 +10,6 @@ answered by the metric too: a ball around the point of rest that fits into the b
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -18,13 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import Array, checked, count
-from cmc.theory.auxiliary import AuxiliarySpace
+from cmc.theory.arrays import Array, checked, count, filled
 from cmc.theory.ball import ball_in_box, lowest
 from cmc.theory.certificates import Certificate, Progress, common_metric, rates_in
 from cmc.theory.identification import differences
 from cmc.theory.metric_search import search_metric
-from cmc.theory.simulate import Loop
+from cmc.theory.simulate import Loop, Transforms
 from cmc.theory.tracking import jumps
 
 _ROUNDS = 6
@@ -54,9 +52,7 @@ class Region:
         high = checked("y_high", self.y_high, "n", n=len(low))
         if not (low < high).all():
             raise ValueError(f"y_high needs values above y_low, (n,) both, got {low} and {high}")
-        reach = checked("integral", self.integral, above=0.0)
-        if reach.shape not in ((), low.shape):
-            raise ValueError(f"integral needs one number or ({len(low)},), got shape {reach.shape}")
+        filled("integral", self.integral, len(low), above=0.0)
         if count("points", self.points, 101) < 2:
             raise ValueError("points needs at least 2 points per axis, got 1")
 
@@ -93,7 +89,7 @@ def spread(low: Array, high: Array, points: int) -> Array:
 def certify_exact(
     policy: Any,
     plant: Any,
-    spaces: Callable[[Array], AuxiliarySpace],
+    spaces: Transforms,
     region: Region,
     *,
     h: float | None = None,

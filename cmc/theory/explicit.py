@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cmc.theory.arrays import Array, checked, compiled, not_square, together
+from cmc.theory.arrays import Array, checked, compiled, first_index, not_square, together
 
 MAX_CONDITION = 2e7
 """Above this condition of `V` (about 1/sqrt(eps)) a matrix counts as defective."""
@@ -119,10 +119,7 @@ def _ill_conditioned(w: NDArray[np.inexact], V: NDArray[np.inexact]) -> NDArray[
 
 def _where(bad: NDArray[np.bool_]) -> str:
     """Say which systems of a batch are meant: '' for a single one."""
-    if bad.ndim == 0:
-        return ""
-    index = tuple(int(i) for i in np.argwhere(bad)[0])
-    return f" at index {index[0] if len(index) == 1 else index} ({int(bad.sum())} of {bad.size})"
+    return f"{first_index(bad)} ({int(bad.sum())} of {bad.size})" if bad.ndim else ""
 
 
 @compiled

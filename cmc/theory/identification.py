@@ -1,4 +1,4 @@
-"""f_y and f_u where nobody gives them, from f or from data; and whether given ones belong to f.
+"""What a plant's f, or its data, say: f_y and f_u, whether given ones fit, and what holds it still.
 
 The method needs df/dy and df/du only (`inverse_solution`). Where f can be called, they are its
 differences. Where no model exists, one can excite the plant with held commands and fit
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import logm
 
-from cmc.theory.arrays import Array, checked, not_overflown, not_square, number, refuse_uncallable
+from cmc.theory.arrays import Array, checked, filled, need, not_overflown, not_square, number
 
 _POINTS = 24
 
@@ -27,14 +27,13 @@ def differences(function: Callable[[Array], Array], x: ArrayLike, step: ArrayLik
 
     `step` is half the width of the difference, one number or one for each entry of x, (m,).
     """
-    refuse_uncallable("function", function)
-    x, step = checked("x", x, "... m"), checked("step", step, above=0.0)
-    if step.shape not in ((), x.shape[-1:]):
-        raise ValueError(f"step needs a number or shape {x.shape[-1:]}, got shape {step.shape}")
-    shift = np.diag(np.broadcast_to(step, x.shape[-1:]))
+    need(callable(function), "function", "a function", function)
+    x = checked("x", x, "... m")
+    step = filled("step", step, x.shape[-1], above=0.0)
+    shift = np.diag(step)
     # both ends in one call: a solver inside then takes the same steps for both
     up, down = function(np.stack([x[..., None, :] + shift, x[..., None, :] - shift]))
-    return np.swapaxes((up - down) / (2 * np.diagonal(shift)[:, None]), -1, -2)
+    return np.swapaxes((up - down) / (2 * step[:, None]), -1, -2)
 
 
 def complex_step(function: Callable[[NDArray[np.complex128]], Any], x: ArrayLike) -> Array:
@@ -43,10 +42,17 @@ def complex_step(function: Callable[[NDArray[np.complex128]], Any], x: ArrayLike
     Squire and Trapp 1998: no difference is taken, so h may be tiny. A function that branches on a
     value or takes its size is not analytic; compare with `differences`.
     """
-    refuse_uncallable("function", function)
+    need(callable(function), "function", "a function", function)
     x = checked("x", x, "... m")
     found = function(x[..., None, :] + 1e-30j * np.eye(x.shape[-1]))
     return np.swapaxes(np.imag(found) / 1e-30, -1, -2)
+
+
+def command_limits(plant: Any) -> tuple[Array, Array]:
+    """Smallest and largest command, (n,) each; infinite where a plant states none."""
+    ends = getattr(plant, "u_low", -np.inf), getattr(plant, "u_high", np.inf)
+    low, high = (np.zeros(plant.n) + np.asarray(end, dtype=float) for end in ends)
+    return low, high
 
 
 def jacobian_fault(plant: Any, low: Array, high: Array) -> str:
@@ -59,13 +65,9 @@ def jacobian_fault(plant: Any, low: Array, high: Array) -> str:
     shape = np.shape(plant.f_u(np.zeros(n), np.zeros(getattr(plant, "m", n))))
     if shape[-2:] != (n, n):
         raise ValueError(not_square(n, shape[-1]))
-    u_low, u_high = (
-        np.where(np.isfinite(u), u, fallback)
-        for u, fallback in (
-            (np.asarray(getattr(plant, "u_low", -np.inf), dtype=float) + np.zeros(n), -1.0),
-            (np.asarray(getattr(plant, "u_high", np.inf), dtype=float) + np.zeros(n), 1.0),
-        )
-    )
+    u_low, u_high = command_limits(plant)
+    u_low = np.where(np.isfinite(u_low), u_low, -1.0)
+    u_high = np.where(np.isfinite(u_high), u_high, 1.0)
     y, u = rng.uniform(low, high, (_POINTS, n)), rng.uniform(u_low, u_high, (_POINTS, n))
     y[0], u[0] = (high + low) / 2, (u_low + u_high) / 2
     u_width = np.where(u_high > u_low, u_high - u_low, 1.0)
@@ -104,6 +106,53 @@ def jacobian_fault(plant: Any, low: Array, high: Array) -> str:
         if plant.constant and not np.allclose(stated, stated[0], rtol=1e-9, atol=0.0):
             return f"{name} is not constant, though the plant says so (`constant` is True)"
     return ""
+
+
+def root(
+    f: Callable[[Array], Array], jacobian: Callable[[Array], Array], x: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Newton's method with halved steps from x (..., m): what it finds, and where it finds no root.
+
+    A LinAlgError says that a Jacobian (..., m, m) on the way is singular.
+    """
+    r = np.asarray(f(x), dtype=float)
+    scale = size = np.linalg.norm(r, axis=-1)
+    for _ in range(60):
+        J = jacobian(x)
+        move = -np.linalg.solve(J, r[..., None])[..., 0]
+        length = np.ones_like(size)
+        met = size <= 1e-13 * (scale + np.linalg.norm(J @ x[..., None], axis=(-2, -1)))
+        for _ in range(30):
+            ahead = np.asarray(f(x + length[..., None] * move), dtype=float)
+            worse = ~(np.linalg.norm(ahead, axis=-1) < size) & ~met
+            if not worse.any():
+                break
+            length = np.where(worse, length / 2, length)
+        step = np.where((length > 1e-8)[..., None], length[..., None] * move, 0.0)
+        x = x + step
+        r = np.asarray(f(x), dtype=float)
+        size = np.linalg.norm(r, axis=-1)
+        if met.all() or (np.abs(step) <= 1e-14 * np.abs(x)).all():
+            break
+    rounding = 1e-13 * np.linalg.norm(J, axis=(-2, -1)) * np.linalg.norm(x, axis=-1)
+    return x, ~(size <= 1e-9 * scale + rounding)
+
+
+def equilibrium(plant: Any, y: ArrayLike, t: float = 0.0) -> Array:
+    """Command that holds a plant still at `y`: the root u of f(y, u, t) = 0, (..., n).
+
+    Newton's method from u = 0; one step where f is affine in u. A `y` that cannot be held (f_u is
+    singular, no root is found) is a ValueError.
+    """
+    y, t = checked("y", y, "... n", n=plant.n), number("t", t)
+    try:
+        u, bad = root(lambda u: plant.f(y, u, t), lambda u: plant.f_u(y, u, t), np.zeros_like(y))
+    except np.linalg.LinAlgError:
+        raise ValueError(f"{plant!r} cannot be held still: f_u is singular") from None
+    if bad.any():
+        where = np.array2string(y[bad][0], precision=4)
+        raise ValueError(f"{plant!r} cannot be held still at y = {where}: no u makes f(y, u) zero")
+    return u
 
 
 class PoorDataError(ValueError):

@@ -67,14 +67,14 @@ def condition_metric(vertices: ArrayLike, metric: ArrayLike, *, discrete: bool =
     inverse = np.linalg.inv(theta)
     # the identity of the original coordinates, seen from the local ones, is the floor of P
     barrier = _Barrier(theta @ J @ inverse, discrete, inverse.T @ inverse, free=False)
-    x = np.append(1.01 * barrier.pack(np.eye(len(start))), 1.1 * 1.01 * np.linalg.cond(start))
+    x = np.append(1.01 * np.eye(len(start))[barrier.at], 1.1 * 1.01 * np.linalg.cond(start))
     if barrier.growth(x).max() >= 0:
         raise ValueError("the metric to start from is not a common metric of the vertices")
     weight = 1 / x[-1]
     while True:
         x = barrier.center(weight, x)
         if (len(J) + 2) * len(start) / weight < 0.02 * x[-1]:
-            return _scaled(theta.T @ barrier.matrix(x) @ theta)
+            return _scaled(theta.T @ x[barrier.index] @ theta)
         weight *= 8.0
 
 
@@ -114,7 +114,7 @@ def _feasible(J: Array, discrete: bool) -> tuple[Array | None, int]:
     """Minimise t subject to growth_v(P) <= t I and I <= P <= condition I; stop at its sign."""
     m = J.shape[-1]
     barrier = _Barrier(J, discrete, np.eye(m), free=True)
-    x = np.append(2.0 * barrier.pack(np.eye(m)), 0.0)  # P = 2 I
+    x = np.append(2.0 * np.eye(m)[barrier.at], 0.0)  # P = 2 I
     x[-1] = barrier.growth(x).max() + 0.1
     weight = 1.0
     while True:
@@ -122,7 +122,7 @@ def _feasible(J: Array, discrete: bool) -> tuple[Array | None, int]:
         growth = barrier.growth(x)
         worst = int(np.argmax(growth))
         if growth[worst] < -_GAP:
-            return barrier.matrix(x), worst
+            return x[barrier.index], worst
         if x[-1] - (len(J) + 2) * m / weight > -_GAP:  # a lower bound on the best t: no metric
             return None, worst
         weight *= 8.0
@@ -150,14 +150,6 @@ class _Barrier:
         size = np.sqrt(np.square(image + _transposed(image)).sum(axis=(1, 2, 3)))
         self.D = D / size[:, None, None]  # every inequality may be scaled by a positive factor
         self.DT = _transposed(self.D)
-
-    def pack(self, P: Array) -> Array:
-        """The entries of P that x holds."""
-        return P[self.at]
-
-    def matrix(self, x: Array) -> Array:
-        """P of x, (m, m)."""
-        return np.asarray(x[self.index])
 
     def growth(self, x: Array) -> Array:
         """Largest eigenvalue of each growth_v(P), (V,)."""

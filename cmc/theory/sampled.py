@@ -11,7 +11,7 @@ with phi = e^{-h/tau}, G = K (1 - phi). Jury's conditions on this 2x2 matrix are
 
 Another quadrature of the integral has another bound: forward Euler or the trapezoid rule decide
 more than a third of random samples differently. The bound is exact for constant slopes; slopes that
-vary need a common metric (`certificates.common_metric` with `h`). `LagLoop` adds a delay and noise.
+vary need a common metric (`certificates.common_metric` with `h`). `LagLoop` adds a delay.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import expm, solve_discrete_lyapunov
+from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from cmc.theory.arrays import Array, checked, number
@@ -54,12 +54,10 @@ def hold(Lambda: ArrayLike, R: ArrayLike, h: float) -> tuple[Array, Array]:
     size = max(float(np.abs(R).max()), 1e-300)  # an exponential knows no units
     block = np.zeros((n + m, n + m))
     block[:n, :n], block[:n, n:] = Lambda * h, R / size
-    if np.abs(block).max() < 1e150:
-        step = expm(block)
-    if np.abs(block).max() >= 1e150 or not np.isfinite(step).all():
-        raise ValueError(
-            f"Lambda h is too large for e^(Lambda h); got {np.abs(Lambda * h).max():g}"
-        )
+    step = expm(block) if np.abs(block).max() < 1e150 else np.nan * block
+    if not np.isfinite(step).all():
+        largest = np.abs(Lambda * h).max()
+        raise ValueError(f"Lambda h is too large for e^(Lambda h); got {largest:g}")
     return step[:n, :n], step[:n, n:] * size * h
 
 
@@ -232,42 +230,6 @@ class LagLoop:
     def spectral_radius(self, delay: float, slope: float) -> float:
         """Largest modulus of a closed-loop pole per sample; below 1 means stable."""
         return float(np.abs(np.linalg.eigvals(self.sample_matrix(delay, slope))).max())
-
-    def _stable(self, delay: float, slope: float) -> tuple[Array, float]:
-        """The matrix of one sample and its spectral radius, below 1."""
-        matrix, radius = self.sample_matrix(delay, slope), self.spectral_radius(delay, slope)
-        if not radius < 1.0:
-            raise ValueError(
-                f"the loop is not stable: spectral radius {radius:.4g} at slope {slope:.4g}; "
-                f"it is stable below {float(self.largest_gain(delay)):.4g}"
-            )
-        return matrix, radius
-
-    def noise_gain(self, delay: float, slope: float) -> float:
-        """Standard deviation of e per standard deviation of independent sensor noise n_k, at rest.
-
-        The policy sees e_k + n_k, and so does its integral: b is the first column of Phi without
-        the lag's own a, and the state's covariance solves S = Phi S Phi^T + b b^T.
-        """
-        matrix, _ = self._stable(delay, slope)
-        b = matrix[:, 0] - np.eye(len(matrix))[0] * np.exp(-self.period / self.tau)
-        return float(np.sqrt(solve_discrete_lyapunov(matrix, np.outer(b, b))[0, 0]))
-
-    def disturbance_gain(self, delay: float, slope: float) -> float:
-        """Largest |e| at the samples per unit of a disturbance |d_k| <= 1 added to the command.
-
-        The sum of the absolute impulse response from rest, until what is left is below 1e-12.
-        """
-        matrix, radius = self._stable(delay, slope)
-        steps = int(np.ceil(np.log(1e-12) / np.log(radius))) + len(matrix)
-        if steps > 10_000_000:
-            raise ValueError(f"the loop decays too slowly to be summed up: {radius!r} a sample")
-        state, total = np.eye(len(matrix))[0], 0.0
-        state = state * self.gain * -np.expm1(-self.period / self.tau)
-        for _ in range(steps):
-            total += abs(state[0])
-            state = matrix @ state
-        return float(total)
 
 
 def _angles() -> Array:

@@ -17,16 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
-from cmc.theory.arrays import (
-    Array,
-    checked,
-    increasing,
-    not_overflown,
-    number,
-    refuse_uncallable,
-    together,
-)
+from cmc.theory.arrays import Array, checked, increasing, need, not_overflown, number, together
 from cmc.theory.auxiliary import AuxiliarySpace, applied, decompose
+from cmc.theory.identification import equilibrium
+from cmc.theory.sampled import hold
 from cmc.theory.slopes import action_of, inner
 from cmc.theory.tracking import aligned
 
@@ -57,7 +51,7 @@ def flow(
     """
     times, s = increasing("t", t), checked("start", start, "... n").copy()
     tol = number("tol", tol, above=0.0)
-    refuse_uncallable("rhs", rhs)
+    need(callable(rhs), "rhs", "a function", rhs)
     path = np.empty((len(times), *s.shape))
     path[0], now, steps = s, float(times[0]), 0
     first = checked("rhs(t, start)", rhs(now, s))
@@ -124,44 +118,6 @@ class Path:
     u: Array
 
 
-def equilibrium(plant: Any, y: ArrayLike, t: float = 0.0) -> Array:
-    """Command that holds a plant still at `y`: the root u of f(y, u, t) = 0, (..., n).
-
-    Newton's method with halved steps, from u = 0; one step where f is affine in u. A `y` that
-    cannot be held (f_u is singular, no root is found) is a ValueError.
-    """
-    y, t = checked("y", y, "... n", n=plant.n), number("t", t)
-    u = np.zeros_like(y)
-    f = np.asarray(plant.f(y, u, t), dtype=float)
-    scale = size = np.linalg.norm(f, axis=-1)
-    for _ in range(60):
-        try:
-            f_u = plant.f_u(y, u, t)
-            move = -np.linalg.solve(f_u, f[..., None])[..., 0]
-        except np.linalg.LinAlgError:
-            raise ValueError(f"{plant!r} cannot be held still: f_u is singular") from None
-        length = np.ones_like(size)
-        met = size <= 1e-13 * (scale + np.linalg.norm(f_u @ u[..., None], axis=(-2, -1)))
-        for _ in range(30):
-            ahead = np.asarray(plant.f(y, u + length[..., None] * move, t), dtype=float)
-            worse = ~(np.linalg.norm(ahead, axis=-1) < size) & ~met
-            if not worse.any():
-                break
-            length = np.where(worse, length / 2, length)
-        step = np.where((length > 1e-8)[..., None], length[..., None] * move, 0.0)
-        u = u + step
-        f = np.asarray(plant.f(y, u, t), dtype=float)
-        size = np.linalg.norm(f, axis=-1)
-        if met.all() or (np.abs(step) <= 1e-14 * np.abs(u)).all():
-            break
-    rounding = 1e-13 * np.linalg.norm(f_u, axis=(-2, -1)) * np.linalg.norm(u, axis=-1)
-    bad = ~(size <= 1e-9 * scale + rounding)
-    if bad.any():
-        where = np.array2string(y[bad][0], precision=4)
-        raise ValueError(f"{plant!r} cannot be held still at y = {where}: no u makes f(y, u) zero")
-    return u
-
-
 def transforms_of(
     plant: Any,
     transforms: AuxiliarySpace | Transforms | None = None,
@@ -174,8 +130,8 @@ def transforms_of(
     """
     if callable(transforms):
         return transforms
-    if transforms is not None and not isinstance(transforms, AuxiliarySpace):
-        raise TypeError(f"transforms needs an AuxiliarySpace or a function, got {transforms!r}")
+    known = transforms is None or isinstance(transforms, AuxiliarySpace)
+    need(known, "transforms", "an AuxiliarySpace or a function", transforms)
 
     def jacobians(y: Array) -> tuple[Array, Array]:
         u = np.zeros(plant.n) if plant.constant else equilibrium(plant, y)
@@ -235,8 +191,8 @@ def closed_loop(
     if h is None:
         s = flow(loop.field, start, times)
         rows = [loop.signals(*_halves(x), float(now)) for x, now in zip(s, times, strict=True)]
-        z, u = (np.stack(part) for part in zip(*rows, strict=True))
-        return Path(times, _halves(s)[0], z, _halves(s)[1], u)
+        z, I, u = (np.stack(part) for part in zip(*rows, strict=True))
+        return Path(times, _halves(s)[0], z, I, u)
     h = number("h", h, above=0.0)
     if times[-1] - times[0] > 1e6 * h:
         raise ValueError(f"h = {h:g} s needs more than 1,000,000 samples up to t = {times[-1]:g} s")
@@ -261,10 +217,9 @@ def _held(loop: Loop, start: Array, times: Array, h: float) -> Path:
     now, k, tiny = float(times[0]), 0, 1e-9 * h
     for i, end in enumerate(times):
         while True:
-            if now >= times[0] + k * h - tiny:  # measure, integrate, hold
-                z = loop.signals(y, I, now)[0]
-                I, k = I + h * z, k + 1
-                u = loop.signals(y, I, now, z)[1]
+            if now >= times[0] + k * h - tiny:
+                _, I, u = loop.signals(y, I, now, h)
+                k += 1
             if now >= end - tiny:
                 break
             until = float(min(times[0] + k * h, end))
@@ -297,39 +252,36 @@ class Loop:
         self.y_ref = np.zeros(()) if callable(y_ref) else _vector("y_ref", y_ref, self.n)
 
     def signals(
-        self, y: Array, I: Array, t: float = 0.0, z: Array | None = None
-    ) -> tuple[Array, Array]:
-        """Auxiliary signal z and command u, (..., n) each."""
+        self, y: Array, I: Array, t: float = 0.0, h: float | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Auxiliary signal z, its integral and command u, (..., n) each; with `h` I + h z first."""
         space = self.spaces(y)
-        if z is None:
-            goal = self.y_ref if self.goal is None else _vector("y_ref", self.goal(t), self.n)
-            z = applied(space.T_y, y - goal)
+        goal = self.y_ref if self.goal is None else _vector("y_ref", self.goal(t), self.n)
+        z = applied(space.T_y, y - goal)
+        I = I if h is None else I + h * z
         a = self.action(np.stack([z, I], axis=-1), space.gains)
         if a.shape[-1:] != (self.n,) or a.ndim > z.ndim:
             raise ValueError(f"policy needs to return shape {z.shape}, got {a.shape}")
         u = self.u0 + applied(space.T_a, a)
-        return z, np.clip(u, self.plant.u_low, self.plant.u_high) if self.clip else u
+        return z, I, np.clip(u, self.plant.u_low, self.plant.u_high) if self.clip else u
 
     def field(self, t: float, s: Array) -> Array:
         """Right-hand side in (y, int z), (..., 2n)."""
-        y, I = _halves(s)
-        z, u = self.signals(y, I, t)
+        y = _halves(s)[0]
+        z, _, u = self.signals(*_halves(s), t)
         return np.concatenate([self.plant.f(y, u, t), z], axis=-1)
 
     def step(self, s: Array, h: float, t: float = 0.0) -> Array:
         """One sample of length h in (y_k, I_{k-1}), (..., 2n)."""
-        y, I = _halves(s)
-        z = self.signals(y, I, t)[0]
-        I = I + h * z
-        return np.concatenate([self.hold(y, self.signals(y, I, t, z)[1], t, t + h), I], axis=-1)
+        y = _halves(s)[0]
+        _, I, u = self.signals(*_halves(s), t, h)
+        return np.concatenate([self.hold(y, u, t, t + h), I], axis=-1)
 
     def hold(self, y: Array, u: Array, t: float, until: float) -> Array:
         """The plant from `t` to `until` under a held command: exact where it is linear."""
-        plant, h = self.plant, until - t
+        plant = self.plant
         if not plant.constant:
             return flow(lambda at, x: plant.f(x, u, at), y, [t, until])[-1]
-        # y' = A (y - y_t) + f(y_t, u) from rest at y_t: h phi_1(A h) f
-        A, n = plant.f_y(np.zeros(self.n), np.zeros(self.n)), self.n
-        block = np.zeros((2 * n, 2 * n))
-        block[:n, :n], block[:n, n:] = A * h, h * np.eye(n)
-        return np.asarray(y + plant.f(y, u, t) @ expm(block)[:n, n:].T)
+        # y' = A (y - y_t) + f(y_t, u), and y - y_t starts from rest
+        A = plant.f_y(np.zeros(self.n), np.zeros(self.n))
+        return y + plant.f(y, u, t) @ hold(A, np.eye(self.n), until - t)[1].T

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from itertools import product
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,13 +13,11 @@ from scipy.linalg import block_diag
 
 from cmc.theory.arrays import Array, checked
 from cmc.theory.auxiliary import AuxiliarySpace
-from cmc.theory.certificates import Certificate, circle_criterion, common_metric
+from cmc.theory.certificates import SHARE, Certificate, circle_criterion, common_metric, corners
 from cmc.theory.contraction import metric_factor
 from cmc.theory.sampled import hold
 
 EPS = 2.2e-16
-# Settling for this share of the slowest block's rate keeps the metric well conditioned.
-_SHARE = 0.9
 
 Action = Callable[[Array, Array], Array]
 
@@ -147,16 +145,16 @@ class BlockLoop:
         d_R = 8 * n * EPS * np.abs(T) @ np.abs(f_u) @ np.abs(space.T_a)
         Lambda = np.where(np.abs(Lambda) <= d_L, 0.0, Lambda)
         R = np.where(np.abs(R) <= d_R, 0.0, R)
-        self.Lambda, self.R = Lambda, R
         self.blocks = _blocks((Lambda != 0) | (R != 0))
         if h is not None:
-            self.Lambda, self.R = hold(Lambda, R, h)
-            reach = np.abs(self.Lambda)
+            Lambda, R = hold(Lambda, R, h)
+            reach = np.abs(Lambda)
             d_L = h * d_L + 40 * n * EPS * np.maximum(reach, reach.max())
-            d_R = h * d_R + 40 * n * EPS * np.abs(self.R).max(axis=0)
+            d_R = h * d_R + 40 * n * EPS * np.abs(R).max(axis=0)
             for block in self.blocks:  # an exponential keeps zeros, but for rounding
-                self.Lambda[np.ix_(range(block[-1] + 1, n), block)] = 0.0
-                self.R[np.ix_(range(block[-1] + 1, n), block)] = 0.0
+                below = np.ix_(range(block[-1] + 1, n), block)
+                Lambda[below] = R[below] = 0.0
+        self.space = replace(space, Lambda=Lambda, R=R)
         size = np.abs(np.stack([low, high])).max(axis=0)
         k1 = size[:, 0] + (0.0 if h is None else h * size[:, 1])
         self.slack = np.zeros((2 * n, 2 * n))
@@ -165,23 +163,13 @@ class BlockLoop:
 
     def matrix(self, slopes: Array) -> Array:
         """Jacobian, or with h the step in (z_k, I_{k-1}), for signed slopes (..., n, 2)."""
-        n, h = self.n, self.h
-        p, q = slopes[..., None, :, 0], slopes[..., None, :, 1]
-        J = np.zeros((*slopes.shape[:-2], 2 * n, 2 * n))
-        J[..., :n, :n] = self.Lambda + self.R * (p if h is None else p + h * q)
-        J[..., :n, n:] = self.R * q
-        J[..., n:, :n] = np.eye(n) * (1.0 if h is None else h)
-        J[..., n:, n:] = np.eye(n) * (0.0 if h is None else 1.0)
-        return J[..., self.keep[:, None], self.keep]
+        return self.space.loop(slopes, self.h)[..., self.keep[:, None], self.keep]
 
     def corners(self, modes: Any) -> Array:
         """Matrices at all corners of the slopes of some modes, the others at their lower ends."""
-        modes = list(modes)
-        ends = [np.unique([self.low[i, m], self.high[i, m]]) for i in modes for m in (0, 1)]
-        picked = np.array(list(product(*ends))).reshape(-1, len(modes), 2)
-        slopes = np.broadcast_to(self.low, (len(picked), self.n, 2)).copy()
-        slopes[:, modes] = picked
-        return self.matrix(slopes)
+        high = self.low.copy()
+        high[list(modes)] = self.high[list(modes)]
+        return self.matrix(corners(self.low, high))
 
     def states(self, block: list[int]) -> NDArray[np.intp]:
         """Where the block's z and int z stand in the state."""
@@ -262,7 +250,7 @@ def compose_hierarchical(
         else:
             comparison = scaled + np.diag(np.exp(-h * np.asarray(rates)))
             rate = -float(np.log(np.linalg.norm(comparison, 2))) / h
-        if rate >= _SHARE * min(rates):
+        if rate >= SHARE * min(rates):
             break
         eps *= 0.7
     blocks = [eps ** (2 * (size - 1 - i)) * metric for i, metric in enumerate(metrics)]
