@@ -90,7 +90,7 @@ class Plant(ABC):
         """Jacobian of `f` in the command, (..., n, n)."""
 
     def hold(self, y: ArrayLike, t: float = 0.0) -> Array:
-        """Command that holds the plant still at `y`; see `cmc.theory.identification.equilibrium`."""
+        """Command that holds the plant still at `y`; see `theory.identification.equilibrium`."""
         return equilibrium(self, y, t)
 
     def space(self, y: ArrayLike = 0.0, u: ArrayLike = 0.0) -> AuxiliarySpace:
