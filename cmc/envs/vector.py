@@ -12,9 +12,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from cmc.theory.arrays import checked, count
+from cmc.theory.arrays import Array, checked, count
 
-Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Step = tuple[Array32, Array, Mask, Mask, dict[str, Any]]
