@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cmc.theory.arrays import Array, checked, number
 from cmc.view.playback.motion import Motion
-from cmc.view.playback.textures import Array
 
 FIELD_OF_VIEW = 40.0  # vertical, degrees, unless a camera has its own
 _Ball = tuple[Array, float]  # center (3,) and radius, m
@@ -46,11 +46,7 @@ def around(
     Raises:
         ValueError: for a center that is not three finite numbers, or a radius that is not positive.
     """
-    middle = np.asarray(center, dtype=float)
-    if middle.shape != (3,) or not np.isfinite(middle).all():
-        raise ValueError(f"center must be three finite numbers, got {center!r}")
-    if not (np.isfinite(radius) and radius > 0):
-        raise ValueError(f"radius must be positive, got {radius}")
+    middle, radius = checked("center", center, "3"), number("radius", radius, above=0.0)
     a, e = np.deg2rad([azimuth, elevation])
     direction = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     position = middle + direction * radius / np.sin(np.deg2rad(FIELD_OF_VIEW / 2))
@@ -64,10 +60,9 @@ def presets(
 
     `moving` are numbers of bodies, `trails` points (T, 3) by name.
     """
-    low, high = motion.low, motion.high
     goes = np.isin(motion.owner, [*moving, -1])  # what is soft moves, too
-    everything = _ball(low, high)
-    subject = _ball(low[0, goes], high[0, goes]) if goes.any() else everything
+    everything = _ball(motion.low, motion.high)
+    subject = _ball(motion.low[0, goes], motion.high[0, goes]) if goes.any() else everything
     places = motion.poses[:, moving, :3].astype(float)
     if not moving:
         soft = [cloth["corners"].mean(axis=1) for cloth in motion.cloths]

@@ -16,9 +16,9 @@ import numpy as np
 import umsgpack
 from numpy.typing import NDArray
 
-from cmc.view.playback.textures import Array, box, plane, texture, texture_address
+from cmc.theory.arrays import Array
+from cmc.view.playback.textures import box, plane, texture, texture_address
 
-_Rgba = tuple[float, float, float, float]
 _Triangles = tuple[Array, NDArray[np.integer], Array | None]  # vertices, faces, texture coordinates
 
 _G = mujoco.mjtGeom
@@ -86,22 +86,24 @@ def transform(position: Array, quaternion: Array) -> Array:
     return matrix
 
 
-def shown_rgba(model: mujoco.MjModel, rgba: Array, material: int) -> _Rgba:
-    """The own color, or the material's where that is the default, times the texture's mean."""
-    if material >= 0 and tuple(rgba) == _DEFAULT_RGBA:
-        rgba = model.mat_rgba[material]
-    pixels = texture(model, material)
-    if pixels is not None:
-        step = max(1, pixels.shape[1] // 128)
-        rgba = rgba * [*(pixels[::step, ::step].mean(axis=(0, 1)) / 255), 1]
-    r, g, b, a = np.clip(rgba, 0.0, 1.0).tolist()
-    return r, g, b, a
+def own_rgba(model: mujoco.MjModel, rgba: Array, material: int) -> Array:
+    """The own color, or the material's where that is the default; a texture is multiplied by it."""
+    default = material >= 0 and tuple(rgba) == _DEFAULT_RGBA
+    return np.clip(model.mat_rgba[material] if default else rgba, 0.0, 1.0)
 
 
-def hexadecimal(rgba: _Rgba) -> int:
+def shown_rgba(model: mujoco.MjModel, rgba: Array, material: int) -> Array:
+    """The same times the texture's mean, for what no texture is mapped on."""
+    pixels, rgba = texture(model, material), own_rgba(model, rgba, material)
+    if pixels is None:
+        return rgba
+    step = max(1, pixels.shape[1] // 128)
+    return rgba * [*(pixels[::step, ::step].mean(axis=(0, 1)) / 255), 1]
+
+
+def hexadecimal(rgba: Array) -> int:
     """A color as 0xRRGGBB."""
-    r, g, b = (round(255 * c) for c in rgba[:3])
-    return (r << 16) + (g << 8) + b
+    return int.from_bytes(round(255 * float(c)) for c in rgba[:3])
 
 
 def _three_object(
@@ -118,9 +120,10 @@ def _three_object(
 
     name, kind, size = f"{what}{index}", _G(get("type")), get("size")
     material, data = (int(get("matid")), int(get("dataid"))) if what == "geom" else (-1, -1)
-    rgba, place = shown_rgba(model, get("rgba"), get("matid")), transform(get("pos"), get("quat"))
     found, scale = _triangles(model, kind, size, material, data), [1.0, 1.0, 1.0]
     mapped = found is not None and found[2] is not None
+    rgba = (own_rgba if mapped else shown_rgba)(model, get("rgba"), get("matid"))
+    place = transform(get("pos"), get("quat"))
     shared = found is not None and kind in _MESHES and not mapped
     uuid = f"mesh{data}" if shared else f"shape {name}"
     if found is None:
@@ -132,9 +135,6 @@ def _three_object(
     known |= {uuid} if shared else set()
     if kind in (_G.mjGEOM_CYLINDER, _G.mjGEOM_CAPSULE):
         place = place @ _Y_TO_Z
-    if mapped:
-        r, g, b = model.mat_rgba[material, :3].tolist()
-        rgba = (r, g, b, rgba[3])
     look = {"uuid": f"mat {name}", **_material(kind, rgba, sides=0 if found is None else 2)}
     ids = {"uuid": f"mesh {name}", "geometry": uuid, "material": look["uuid"]}
     matrix = np.diag([*scale, 1.0]).ravel().tolist()
@@ -152,18 +152,19 @@ def _three_object(
     return whole, place
 
 
-def _material(kind: mujoco.mjtGeom, rgba: _Rgba, sides: int) -> dict[str, Any]:
+def _material(kind: mujoco.mjtGeom, rgba: Array, sides: int) -> dict[str, Any]:
     """A three.js material; `sides` is 2 for both sides of open shapes."""
+    opacity = float(rgba[3])
     return {
         "type": "MeshPhongMaterial",
         "color": hexadecimal(rgba),
-        "opacity": rgba[3],
-        "transparent": rgba[3] < 1.0,
+        "opacity": opacity,
+        "transparent": opacity < 1.0,
         "side": sides,
         "shininess": 35,
         "specular": 0x2A2A2A,
         "flatShading": kind in (*_MESHES, _G.mjGEOM_BOX),
-        "depthWrite": rgba[3] == 1.0,  # what lies behind a see-through wall is seen from every side
+        "depthWrite": opacity == 1.0,  # what lies behind a see-through wall is seen from every side
         "polygonOffset": kind == _G.mjGEOM_PLANE,  # lines drawn on a floor stay visible
         "polygonOffsetFactor": 0,
         "polygonOffsetUnits": 4,

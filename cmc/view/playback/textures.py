@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array
+
 _Triangles = tuple[Array, NDArray[np.integer], Array]  # vertices, faces, texture coordinates
 _INFINITE = 60.0  # half-size in metres at which a plane without bounds is drawn
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
