@@ -141,8 +141,6 @@ class PegTouchVectorEnv(NativeVectorEnv):
         sampled: values drawn at reset, name in `SAMPLED` to (num_envs,) array.
     """
 
-    privileged_size = 10
-
     def __init__(
         self,
         num_envs: int = 1,
