@@ -215,6 +215,29 @@ def test_a_mesh_used_often_is_stored_and_held_once(opened):
     assert held == [1, 30 * len(attribute(mesh, "position"))]
 
 
+def test_a_texture_used_often_is_stored_and_held_once(opened):
+    def made(count):
+        geoms = "".join(
+            f'<geom type="box" size=".1 .1 .1" pos="{k} 0 0" material="m"/>' for k in range(count)
+        )
+        asset = """<texture name="t" type="2d" builtin="flat" random=".5" mark="random" width="256"
+          height="256" rgb1="1 0 0"/><material name="m" texture="t"/>"""
+        xml = f"<mujoco><asset>{asset}</asset><worldbody>{geoms}</worldbody></mujoco>"
+        return record(load(xml), np.zeros((1, 0)), [0.0])
+
+    (first,) = (c["object"] for c in commands(made(1), "set_object").values())
+    each = (len(made(9).html()) - len(made(1).html())) / 8
+    assert each < 5000 < len(first["images"][0]["url"]) / 2
+    page = opened(made(9))
+    widths = """() => {
+      const maps = new Set(), seen = cmcPlayback.viewer.scene_tree.find(["meshcat"]).object;
+      seen.traverse((o) => { if (o.isMesh) maps.add(o.material.map); });
+      return Array.from(maps).map((map) => map.image?.width);
+    }"""
+    until(page, f"({widths})()[0]")
+    assert page.evaluate(widths) == [256]
+
+
 def test_two_scenes_play_side_by_side_under_one_slider(opened):
     model = load(TWINS)
     times = np.array([0.0, 1.0])

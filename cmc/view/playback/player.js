@@ -24,11 +24,13 @@ const viewer = new MeshCat.Viewer(element("div", "canvas", pane));
 const resize = viewer.set_3d_pane_size.bind(viewer);
 viewer.set_3d_pane_size = (width, height) => resize(  // the bar below must not hide the scene
   width ?? pane.clientWidth, height ?? window.innerHeight - byId("bar").offsetHeight);
-// A mesh that is used again comes as a stand-in with the first one's uuid.
-const shapes = {}, place = viewer.set_object.bind(viewer);
+// A mesh or texture that is used again comes as a stand-in with the first one's uuid.
+const first = {}, place = viewer.set_object.bind(viewer);
 viewer.set_object = (path, object) => {
+  const once = (thing) => first[thing.uuid] ??= thing;
   object.traverse((part) => {
-    if (part.geometry) part.geometry = shapes[part.geometry.uuid] ??= part.geometry;
+    if (part.geometry) part.geometry = once(part.geometry);
+    if (part.material?.map) part.material.map = once(part.material.map);
   });
   place(path, object);
 };

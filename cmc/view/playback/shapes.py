@@ -25,6 +25,7 @@ _G = mujoco.mjtGeom
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 _DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
 _MESHES = (_G.mjGEOM_MESH, _G.mjGEOM_SDF)
+_STAND_IN = "data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAA="  # of a texture sent before
 
 
 def draw(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[int]) -> list[bytes]:
@@ -33,7 +34,7 @@ def draw(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[int]) -> l
     What has no counterpart is left out and named in a warning.
     """
     commands: list[bytes] = []
-    known: set[str] = set()
+    known: dict[str, str] = {}
     paths = body_paths(model)
 
     def send(kind: str, path: str, **more: Any) -> None:
@@ -107,12 +108,13 @@ def hexadecimal(rgba: Array) -> int:
 
 
 def _three_object(
-    model: mujoco.MjModel, what: str, index: int, known: set[str]
+    model: mujoco.MjModel, what: str, index: int, known: dict[str, str]
 ) -> tuple[dict[str, Any], Array]:
     """A geom or site as three.js reads it from JSON, and its transform in its body's frame.
 
-    Textures are mapped on geoms. Of a mesh in `known` only the uuid is sent. The uuids are made of
-    names, so that the same recording is the same file. A type without a counterpart is refused.
+    Textures are mapped on geoms. Of a mesh or texture in `known` only the uuid is sent. The uuids
+    are made of names, so that the same recording is the same file. A type without a counterpart is
+    refused.
     """
 
     def get(field: str) -> Any:
@@ -132,7 +134,7 @@ def _three_object(
         shape = {"type": "BoxGeometry", "width": 0, "height": 0, "depth": 0}
     else:
         shape = _buffer(*found)
-    known |= {uuid} if shared else set()
+    known |= {uuid: uuid} if shared else {}
     if kind in (_G.mjGEOM_CYLINDER, _G.mjGEOM_CAPSULE):
         place = place @ _Y_TO_Z
     look = {"uuid": f"mat {name}", **_material(kind, rgba, sides=0 if found is None else 2)}
@@ -145,10 +147,12 @@ def _three_object(
         "object": {**ids, "type": "Mesh", "matrix": matrix},
     }
     if mapped:
-        look["map"], image = f"map {name}", f"image {name}"
+        url, image = texture_address(model, material), f"image {name}"
+        look["map"] = known.setdefault(url, f"map {name}")
         wrap = {"wrap": [1000, 1000], "repeat": [1, 1]}
         whole["textures"] = [{"uuid": look["map"], **wrap, "image": image}]
-        whole["images"] = [{"uuid": image, "url": texture_address(model, material)}]
+        sent = url if look["map"] == f"map {name}" else _STAND_IN
+        whole["images"] = [{"uuid": image, "url": sent}]
     return whole, place
 
 
