@@ -255,7 +255,7 @@ class PegTouchVectorEnv(NativeVectorEnv):
             columns = np.stack([self.signal, self.integral], axis=-1).reshape(-1, 4)
         return columns.astype(np.float32)
 
-    def _describe(self, info: dict[str, Any]) -> dict[str, Array32]:
+    def _describe(self) -> dict[str, Array32]:
         """What a critic may know, if it is wanted."""
         if not self._with_privileged:
             return {}

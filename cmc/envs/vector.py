@@ -78,7 +78,7 @@ class NativeVectorEnv(VectorEnv[Array32, ArrayLike, Any]):
     def _advance(self, actions: ArrayLike) -> Step:
         """One step of all: observations, reward, terminated, truncated, info."""
 
-    def _describe(self, info: dict[str, Any]) -> dict[str, Any]:
+    def _describe(self) -> dict[str, Any]:
         """What `info` says of the present states, after a start as well as after a step."""
         return {}
 
@@ -93,7 +93,7 @@ class NativeVectorEnv(VectorEnv[Array32, ArrayLike, Any]):
         self._seed(seed)
         self._ended = self._ended & ~mask
         obs, self._begun = self._begin(mask, options), True
-        return obs, self._describe({})
+        return obs, self._describe()
 
     def step(self, actions: ArrayLike) -> Step:
         """One step of every trajectory."""
@@ -106,11 +106,11 @@ class NativeVectorEnv(VectorEnv[Array32, ArrayLike, Any]):
             info = _each(info, lambda value: np.where(fresh, np.zeros((), value.dtype), value))
             terminated, truncated = terminated & ~fresh, truncated & ~fresh
         self._ended = ended = terminated | truncated
-        info = info | self._describe(info)
+        info = info | self._describe()
         if self.mode is AutoresetMode.SAME_STEP and ended.any():
             final = {"final_obs": obs, "_final_obs": ended, "_final_info": ended}
             obs = self._begin(ended, {})
-            info = info | final | {"final_info": info} | self._describe({})
+            info = info | final | {"final_info": info} | self._describe()
         return obs, reward, terminated, truncated, info
 
 
