@@ -93,8 +93,7 @@ def test_every_plant_is_an_environment(name):
     check_env_sb3(env, warn=False)
     twin = copy.deepcopy(env)
     np.testing.assert_array_equal(env.reset(seed=1)[0], twin.reset(seed=1)[0])
-    u = env.action_space.high
-    np.testing.assert_array_equal(env.step(u)[0], twin.step(u)[0])
+    np.testing.assert_array_equal(env.step(env.plant.u_high)[0], twin.step(env.plant.u_high)[0])
 
 
 def test_who_leaves_the_room_has_ended():

@@ -243,12 +243,12 @@ def test_overlays_are_broadcast_and_get_different_colors(model):
         ({"readouts": {"f": [1.0, 2.0]}}, "f"),
         ({"trails": ["nowhere"]}, "no site and no body named 'nowhere'"),
         ({"labels": {"a": "nowhere"}}, "no site and no body named 'nowhere'"),
-        (lambda q, t: (q[:, :-1], t), "states needs shape"),
-        (lambda q, t: (q[0], t), "states needs shape"),
-        (lambda q, t: (q, t[:-1]), "states needs shape .* a row for each time"),
-        (lambda q, t: (q[:0], t[:0]), "times needs shape"),
-        (lambda q, t: (q, t[::-1]), "times needs .* increasing"),
-        (lambda q, t: (np.where(q == q[1, 0], np.nan, q), t), "states needs finite"),
+        (lambda q, t: (q[:, :-1], t), "states must have shape"),
+        (lambda q, t: (q[0], t), "states must have shape"),
+        (lambda q, t: (q, t[:-1]), "states must have shape .* a row for each time"),
+        (lambda q, t: (q[:0], t[:0]), "times must be at least one"),
+        (lambda q, t: (q, t[::-1]), "increase"),
+        (lambda q, t: (np.where(q == q[1, 0], np.nan, q), t), "finite"),
     ],
 )
 def test_bad_trajectories_and_overlays_are_refused(model, wrong, message):

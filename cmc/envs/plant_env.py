@@ -112,3 +112,9 @@ class PlantEnv(SingleEnv):
     """One trajectory of a plant; everything else is documented at `PlantVectorEnv`."""
 
     many = PlantVectorEnv
+
+    @property
+    def plant(self) -> Plant:
+        """The plant."""
+        plant: Plant = self.batch.plant
+        return plant

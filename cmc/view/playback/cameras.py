@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import Array, checked, number
 from cmc.view.playback.motion import Motion
+from cmc.view.playback.textures import Array
 
 FIELD_OF_VIEW = 40.0  # vertical, degrees, unless a camera has its own
 _Ball = tuple[Array, float]  # center (3,) and radius, m
@@ -46,7 +46,11 @@ def around(
     Raises:
         ValueError: for a center that is not three finite numbers, or a radius that is not positive.
     """
-    middle, radius = checked("center", center, "3"), number("radius", radius, above=0.0)
+    middle = np.asarray(center, dtype=float)
+    if middle.shape != (3,) or not np.isfinite(middle).all():
+        raise ValueError(f"center must be three finite numbers, got {center!r}")
+    if not (np.isfinite(radius) and radius > 0):
+        raise ValueError(f"radius must be positive, got {radius}")
     a, e = np.deg2rad([azimuth, elevation])
     direction = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     position = middle + direction * radius / np.sin(np.deg2rad(FIELD_OF_VIEW / 2))

@@ -10,9 +10,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from cmc.theory.arrays import Array
 from cmc.view.playback.shapes import hexadecimal, own_rgba, shown_rgba, visible
-from cmc.view.playback.textures import texture, texture_address
+from cmc.view.playback.textures import Array, texture, texture_address
 
 _Soft = tuple[dict[str, Any], Callable[[mujoco.MjData], Array]]
 _SAMPLED = 24  # frames at which the extent of a motion is looked at

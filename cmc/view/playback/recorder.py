@@ -23,12 +23,12 @@ from IPython.display import HTML, IFrame
 from numpy.typing import ArrayLike, NDArray
 
 from cmc.store import write_atomic
-from cmc.theory.arrays import Array, checked, increasing
 from cmc.view.playback.cameras import Camera, presets
 from cmc.view.playback.live import LiveView
 from cmc.view.playback.motion import Motion, skins
 from cmc.view.playback.page import page
 from cmc.view.playback.shapes import body_paths, draw, visible
+from cmc.view.playback.textures import Array
 
 _STATES = (mujoco.mjtState.mjSTATE_FULLPHYSICS, mujoco.mjtState.mjSTATE_INTEGRATION)
 
@@ -226,8 +226,9 @@ def _overlays(
         look = {"color": color, "radius": marker.radius}
         yield {"kind": "Marker", "name": name, "points": _fit(name, marker.points, *shapes), **look}
     for name, arrow in arrows.items():
-        parts = {"points": arrow.points, "vectors": arrow.vectors}
-        rows = {key: _fit(name, checked(name, part), *shapes) for key, part in parts.items()}
+        rows = {key: _fit(name, getattr(arrow, key), *shapes) for key in ("points", "vectors")}
+        if not all(np.isfinite(array).all() for array in rows.values()):
+            raise ValueError(f"arrow {name!r} must be finite")
         look = {"scale": arrow.scale, "radius": arrow.radius, "color": _ARROW, "threshold": 1e-3}
         yield {"kind": "Arrow", "name": name, **rows, **look}
     for word, at in words.items():
@@ -236,7 +237,7 @@ def _overlays(
 
 def _fit(name: str, array: ArrayLike, *shapes: tuple[int, ...]) -> Array:
     """An array of one of the shapes, broadcast to the last."""
-    rows = checked(name, array, finite=False)
+    rows = np.asarray(array, dtype=float)
     if rows.shape not in shapes:
         wanted = " or ".join(map(str, shapes))
         raise ValueError(f"{name!r} must have shape {wanted}, got {rows.shape}")
@@ -247,12 +248,16 @@ def _checked(
     model: mujoco.MjModel, states: Any, times: ArrayLike
 ) -> tuple[Array, Array, int | None]:
     """Times, rows of states, and the `mjtState` they follow (None: joint positions)."""
-    time, rows = increasing("times", times, least=1), checked("states", states)
+    time, rows = np.asarray(times, dtype=float), np.asarray(states, dtype=float)
+    if not (np.isfinite(time).all() and np.isfinite(rows).all()):
+        raise ValueError("states and times must be finite")
+    if time.ndim != 1 or len(time) == 0 or np.any(np.diff(time) <= 0.0):
+        raise ValueError(f"times must be at least one, and increase strictly, got {time}")
     full = {int(mujoco.mj_stateSize(model, s)): int(s) for s in reversed(_STATES)}
     specs: dict[int, int | None] = {**full, model.nq: None}
     if rows.ndim != 2 or len(rows) != len(time) or rows.shape[1] not in specs:
         raise ValueError(
-            f"states needs shape ({len(time)}, n), a row for each time, with n = {model.nq} for "
-            f"joint positions or in {sorted(full)} for full states, got {rows.shape}"
+            f"states must have shape ({len(time)}, n), a row for each time, with n = {model.nq} "
+            f"for joint positions or in {sorted(full)} for full states, got {rows.shape}"
         )
     return time, rows, specs[rows.shape[1]]

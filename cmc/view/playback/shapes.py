@@ -16,8 +16,7 @@ import numpy as np
 import umsgpack
 from numpy.typing import NDArray
 
-from cmc.theory.arrays import Array
-from cmc.view.playback.textures import box, plane, texture, texture_address
+from cmc.view.playback.textures import Array, box, plane, texture, texture_address
 
 _Triangles = tuple[Array, NDArray[np.integer], Array | None]  # vertices, faces, texture coordinates
 

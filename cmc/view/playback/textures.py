@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from cmc.theory.arrays import Array
-
+Array = NDArray[np.float64]
 _Triangles = tuple[Array, NDArray[np.integer], Array]  # vertices, faces, texture coordinates
 _INFINITE = 60.0  # half-size in metres at which a plane without bounds is drawn
 _SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
