@@ -148,6 +148,13 @@ def test_a_texture_is_multiplied_by_the_color_that_its_geom_would_have_without_i
         assert drawn[f"geom{k}"]["images"]
 
 
+def test_a_camera_within_a_mesh_looks_out_of_it_as_in_mujoco(recording):
+    drawn = {p.split("/")[-1]: c["object"] for p, c in commands(recording, "set_object").items()}
+    sides = {name: made["materials"][0]["side"] for name, made in drawn.items()}
+    front, both = 0, 2  # FrontSide and DoubleSide of three.js
+    assert (sides["geom0"], sides["geom10"]) == (both, front)
+
+
 def test_sites_are_drawn_where_they_have_a_material():
     model = load(
         """<mujoco><asset><material name="goal" rgba="0 1 0 .4"/></asset><worldbody>

@@ -24,6 +24,7 @@ _G = mujoco.mjtGeom
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 _DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
 _MESHES = (_G.mjGEOM_MESH, _G.mjGEOM_SDF)
+_OPEN = (_G.mjGEOM_PLANE, _G.mjGEOM_HFIELD)  # seen from both sides; MuJoCo hides meshes' insides
 _STAND_IN = "data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAA="  # of a texture sent before
 
 
@@ -136,7 +137,7 @@ def _three_object(
     known |= {uuid: uuid} if shared else {}
     if kind in (_G.mjGEOM_CYLINDER, _G.mjGEOM_CAPSULE):
         place = place @ _Y_TO_Z
-    look = {"uuid": f"mat {name}", **_material(kind, rgba, sides=0 if found is None else 2)}
+    look = {"uuid": f"mat {name}", **_material(kind, rgba, sides=2 if kind in _OPEN else 0)}
     ids = {"uuid": f"mesh {name}", "geometry": uuid, "material": look["uuid"]}
     matrix = np.diag([*scale, 1.0]).ravel().tolist()
     whole: dict[str, Any] = {
