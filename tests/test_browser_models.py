@@ -55,10 +55,13 @@ STRING = """<mujoco><worldbody><site name="hook" pos="0 0 1"/>
   <body name="ball"><joint type="slide" axis="0 0 1"/><geom size=".05"/><site name="eye"/></body>
   </worldbody><tendon><spatial name="string" width=".01" rgba="1 0 0 1"><site site="hook"/>
   <geom geom="pulley" sidesite="beside"/><site site="eye"/></spatial></tendon></mujoco>"""
-WORM = """<mujoco><asset><mesh name="tetra" vertex="0 0 0 .1 0 0 0 .1 0 0 0 .1"/></asset>
+WORM = """<mujoco><asset><mesh name="tetra" vertex="0 0 0 .1 0 0 0 .1 0 0 0 .1"/>
+  <texture name="squares" type="2d" builtin="checker" rgb1="1 0 0" width="16" height="16"/>
+  <material name="squares" texture="squares" rgba=".5 1 1 1"/></asset>
   <worldbody><body name="a"><joint axis="0 0 1"/><geom size=".02" group="4"/>
   <body name="b" pos=".3 0 0"><joint axis="0 1 0"/><geom size=".02" group="4"/></body></body>
-  </worldbody><deformable><skin name="s" vertex="0 0 0 .3 0 0 .3 .1 0 .6 0 0" face="0 1 2 1 3 2">
+  </worldbody><deformable><skin name="s" vertex="0 0 0 .3 0 0 .3 .1 0 .6 0 0" face="0 1 2 1 3 2"
+  material="squares" texcoord="0 0 .5 0 .5 1 1 .25">
   <bone body="a" bindpos="0 0 0" bindquat="1 0 0 0" vertid="0 1 2" vertweight="1 .5 .3"/>
   <bone body="b" bindpos=".3 0 0" bindquat="1 0 0 0" vertid="1 2 3" vertweight=".5 .7 1"/>
   </skin></deformable></mujoco>"""
@@ -110,6 +113,11 @@ def test_a_skin_goes_along_with_its_bones_as_mujoco_s_does(opened):
     wanted = np.reshape(seen.skinvert, (-1, 3))[: model.nskinvert]
     np.testing.assert_allclose(corners(page, "skin 0"), wanted, atol=1e-5)
     assert np.ptp(wanted[:, 2]) > 0.1
+    skin = "cmcPlayback.viewer.scene.getObjectByName('overlay skin 0')"
+    until(page, f"{skin}.material.map?.image?.width === 16")
+    assert page.evaluate(f"{skin}.material.color.toArray()") == pytest.approx([0.5, 1, 1], abs=0.01)
+    given = page.evaluate(f"Array.from({skin}.geometry.attributes.uv.array)")
+    assert given == [0, 0, 0.5, 0, 0.5, 1, 1, 0.25]
 
 
 def test_a_string_runs_over_its_pulley(opened):
@@ -205,6 +213,29 @@ def test_a_mesh_used_often_is_stored_and_held_once(opened):
     )
     (mesh,) = (c["object"] for c in commands(one, "set_object").values())
     assert held == [1, 30 * len(attribute(mesh, "position"))]
+
+
+def test_a_texture_used_often_is_stored_and_held_once(opened):
+    def made(count):
+        geoms = "".join(
+            f'<geom type="box" size=".1 .1 .1" pos="{k} 0 0" material="m"/>' for k in range(count)
+        )
+        asset = """<texture name="t" type="2d" builtin="flat" random=".5" mark="random" width="256"
+          height="256" rgb1="1 0 0"/><material name="m" texture="t"/>"""
+        xml = f"<mujoco><asset>{asset}</asset><worldbody>{geoms}</worldbody></mujoco>"
+        return record(load(xml), np.zeros((1, 0)), [0.0])
+
+    (first,) = (c["object"] for c in commands(made(1), "set_object").values())
+    each = (len(made(9).html()) - len(made(1).html())) / 8
+    assert each < 5000 < len(first["images"][0]["url"]) / 2
+    page = opened(made(9))
+    widths = """() => {
+      const maps = new Set(), seen = cmcPlayback.viewer.scene_tree.find(["meshcat"]).object;
+      seen.traverse((o) => { if (o.isMesh) maps.add(o.material.map); });
+      return Array.from(maps).map((map) => map.image?.width);
+    }"""
+    until(page, f"({widths})()[0]")
+    assert page.evaluate(widths) == [256]
 
 
 def test_two_scenes_play_side_by_side_under_one_slider(opened):

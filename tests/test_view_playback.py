@@ -136,6 +136,25 @@ def test_colors_follow_mujoco_s_rule():
         assert look(drawn[f"geom{k}"]) == pytest.approx(rgba, abs=0.01)
 
 
+def test_a_texture_is_multiplied_by_the_color_that_its_geom_would_have_without_it():
+    drawn = still(
+        """<mujoco><asset><texture name="t" type="2d" builtin="checker" width="16" height="16"/>
+        <material name="m" texture="t" rgba=".2 .6 .9 1"/></asset><worldbody>
+        <geom type="plane" size="1 1 1" material="m"/>
+        <geom type="plane" size="1 1 1" material="m" rgba=".8 .9 .7 .5"/></worldbody></mujoco>"""
+    )
+    for k, rgba in enumerate([[0.2, 0.6, 0.9, 1], [0.8, 0.9, 0.7, 0.5]]):
+        assert look(drawn[f"geom{k}"]) == pytest.approx(rgba, abs=0.01)
+        assert drawn[f"geom{k}"]["images"]
+
+
+def test_a_camera_within_a_mesh_looks_out_of_it_as_in_mujoco(recording):
+    drawn = {p.split("/")[-1]: c["object"] for p, c in commands(recording, "set_object").items()}
+    sides = {name: made["materials"][0]["side"] for name, made in drawn.items()}
+    front, both = 0, 2  # FrontSide and DoubleSide of three.js
+    assert (sides["geom0"], sides["geom10"]) == (both, front)
+
+
 def test_sites_are_drawn_where_they_have_a_material():
     model = load(
         """<mujoco><asset><material name="goal" rgba="0 1 0 .4"/></asset><worldbody>
@@ -233,8 +252,8 @@ def test_overlays_are_broadcast_and_get_different_colors(model):
         ({"labels": {"a": "nowhere"}}, "no site and no body named 'nowhere'"),
         (lambda q, t: (q[:, :-1], t), "states must have shape"),
         (lambda q, t: (q[0], t), "states must have shape"),
-        (lambda q, t: (q, t[:-1]), "times must have shape"),
-        (lambda q, t: (q[:0], t[:0]), "one frame"),
+        (lambda q, t: (q, t[:-1]), "states must have shape .* a row for each time"),
+        (lambda q, t: (q[:0], t[:0]), "times must be at least one"),
         (lambda q, t: (q, t[::-1]), "increase"),
         (lambda q, t: (np.where(q == q[1, 0], np.nan, q), t), "finite"),
     ],

@@ -9,7 +9,6 @@ import pytest
 
 from cmc.view import picture
 from cmc.view import sliders as ui
-from cmc.view.picture import PictureError
 
 PANEL = ui.panel(ui.lines("t", "y"), x="time (s)", y="y", title="rate {rate:.1f}")
 PLAIN = ui.panel(ui.lines("t", "y"), x="t", y="y")
@@ -176,7 +175,7 @@ def test_bad_layouts_are_named(call, message):
 )
 def test_arrays_that_do_not_fit_a_layer_are_named(layer, message):
     data = {"t": np.zeros(5), "y": np.zeros((5, 3)), "n": np.zeros(4), "words": "a", "M": [[1.0]]}
-    with pytest.raises(PictureError, match=message):
+    with pytest.raises(ValueError, match=message):
         picture.encode([ui.panel(layer, x="x", y="y")], data)
 
 

@@ -11,8 +11,8 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike
 
 from cmc.envs.plant_env import PlantVectorEnv
-from cmc.envs.vector import Array, Array32, Mask, NativeVectorEnv, Seed, Step
-from cmc.theory.arrays import checked, number, refuse_uncallable
+from cmc.envs.vector import Array32, Mask, NativeVectorEnv, Seed, Step
+from cmc.theory.arrays import Array, checked, number, refuse_uncallable
 from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.tracking import Tracker
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any
 
 import gymnasium as gym
 import mujoco
@@ -15,10 +15,10 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike, NDArray
 
 from cmc.envs.panda_task import PandaTask
-from cmc.envs.vector import Array, Array32, Mask, NativeVectorEnv, Seed, SingleEnv, Step
-from cmc.theory.arrays import checked, refuse_uncallable
+from cmc.envs.vector import Array32, Mask, NativeVectorEnv, Seed, SingleEnv, Step
+from cmc.theory.arrays import Array, checked, refuse_uncallable
 
-ActionMode = Literal["two_level", "low", "high"]
+ACTION_MODES = ("two_level", "low", "high")
 
 
 class PandaVectorEnv(NativeVectorEnv):
@@ -39,14 +39,13 @@ class PandaVectorEnv(NativeVectorEnv):
     def __init__(
         self,
         task: PandaTask,
-        action_mode: ActionMode = "two_level",
+        action_mode: str = "two_level",
         low_level: Callable[[Array, Array], ArrayLike] | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         render_mode: str | None = None,
     ) -> None:
-        modes = get_args(ActionMode)
-        if action_mode not in modes:
-            raise ValueError(f"action_mode must be one of {modes}, got {action_mode!r}")
+        if action_mode not in ACTION_MODES:
+            raise ValueError(f"action_mode must be one of {ACTION_MODES}, got {action_mode!r}")
         if low_level is not None:
             refuse_uncallable("low_level", low_level)
             if action_mode != "high" or task.config.command == "joint":

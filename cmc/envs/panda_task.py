@@ -14,11 +14,11 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.envs.vector import Array, Mask, Seed, generators, masked, set_counts, set_numbers
+from cmc.envs.vector import Mask, Seed, generators, masked, set_counts, set_numbers
 from cmc.robot.osc import ControlLaw, Gains, Worlds
 from cmc.robot.panda import FINGERTIP, JOINTS, LOWER, UPPER, Peg, inverse_kinematics, load_scene
 from cmc.robot.tick import ROOM, ROW
-from cmc.theory.arrays import checked
+from cmc.theory.arrays import Array, checked
 
 HIGH_LEVEL = ("position", "rotation", "velocity", "goal")
 """Observation fields that a planner sees; tasks add their own (`PandaTask.high_level`)."""
@@ -66,9 +66,8 @@ class PandaTaskConfig:
         set_numbers(self, "", ("tilt_limit", "tick", "timestep"), above=0.0)
         set_counts(self, ("ticks", "horizon"))
         joint = self.command == "joint"
-        sizes = {"subgoal": JOINTS if joint else 6 if self.increments else 3}
-        sizes["workspace"] = JOINTS if joint else 3
-        for name, size in sizes.items():
+        sizes = (JOINTS, JOINTS) if joint else (6 if self.increments else 3, 3)
+        for name, size in zip(("subgoal", "workspace"), sizes, strict=True):
             sides = (f"{name}_low", f"{name}_high")
             set_numbers(self, str(size), sides)
             low, high = (np.array(getattr(self, side)) for side in sides)
@@ -153,8 +152,8 @@ class PandaTask:
             fields |= {name: at[name][:JOINTS] for name in ("joints", "joint_velocity")}
             fields["joint_error"] = at["joint_error"]
         else:
-            fields |= {"error": at["signals"][:6], "latent": at["latent"]}
-            fields["integral"] = at["integral"]
+            fields["error"] = at["signals"][:6]
+            fields |= {name: at[name] for name in ("latent", "integral")}
         return fields | {"time_to_go": at["left"][None]}
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -258,10 +257,7 @@ class PandaTask:
     def step(self, u: ArrayLike) -> tuple[Array, Array, Mask, Mask, dict[str, Any]]:
         """One tick under low-level actions (N, low_size) in `u_limit`, clipped to [-1, 1].
 
-        Gives observations (N, size), reward (N,), terminated (never), truncated (time is up) and
-        info: `reward_terms` and `tracking_terms` (the low level's reward) by name, `contact_force`
-        at the end of the tick and `contact_force_max` over its physics steps (N), `penetration`
-        (m, deepest of the tick), `success`.
+        Gives observations (N, size), reward, terminated, truncated and info, as `PandaEnv` does.
         """
         self.worlds.tick(u)
         distance, tilt, force, largest, deepest, missed, turned = self._numbers.T.copy()

@@ -9,9 +9,9 @@ import numpy as np
 
 from cmc.envs.panda_gym import PandaEnv, PandaVectorEnv
 from cmc.envs.panda_task import PandaTask, PandaTaskConfig
-from cmc.envs.vector import Array
 from cmc.robot.osc import MAZE_GAINS, ControlLaw
 from cmc.robot.panda import Peg
+from cmc.theory.arrays import Array
 
 GOAL_LOW = np.array([0.410, -0.025, 0.005])
 GOAL_HIGH = np.array([0.415, -0.020, 0.015])

@@ -9,9 +9,9 @@ import numpy as np
 
 from cmc.envs.panda_gym import PandaEnv, PandaVectorEnv
 from cmc.envs.panda_task import PandaTask, PandaTaskConfig
-from cmc.envs.vector import Array
 from cmc.robot.osc import PUSH_GAINS, ControlLaw
 from cmc.robot.panda import Peg
+from cmc.theory.arrays import Array
 
 BOX_TOP = np.array([0.52, 0.0, 0.02])
 """Centre of the box's top, m; our choice: the arm can tilt by 0.5 rad all around it."""

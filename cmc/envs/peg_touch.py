@@ -10,18 +10,9 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from numpy.typing import ArrayLike
 
-from cmc.envs.vector import (
-    Array,
-    Array32,
-    Mask,
-    NativeVectorEnv,
-    SingleEnv,
-    Step,
-    set_counts,
-    set_numbers,
-)
+from cmc.envs.vector import Array32, Mask, NativeVectorEnv, SingleEnv, Step, set_counts, set_numbers
 from cmc.plants import Peg
-from cmc.theory.arrays import checked
+from cmc.theory.arrays import Array, checked
 
 INTERFACES = ("auxiliary", "identity", "raw")
 SAMPLED = ("x0", "z0", "x_d", "f_d", "K_sur", "surface_sin", "surface_cos")
@@ -76,10 +67,9 @@ class PegTouchConfig:
     """What the plant has otherwise than T_y and T_a believe. Paper, fig:1 c."""
 
     def __post_init__(self) -> None:
-        positive = ["tau_x", "tau_z", "h", "action_limit", "force_error_cap"]
         ranges = ("surface", "x_limits", "z_limits", "x_d", "f_d", "x0", "z0")
-        if self.stiffness_reference is not None:
-            positive.append("stiffness_reference")
+        reference = () if self.stiffness_reference is None else ("stiffness_reference",)
+        positive = ("tau_x", "tau_z", "h", "action_limit", "force_error_cap", *reference)
         set_numbers(self, "", positive, above=0.0)
         set_numbers(self, "", ("weight_x", "weight_f", "mount_angle"))
         set_numbers(self, "2", (*ranges, "u0"))
@@ -151,8 +141,6 @@ class PegTouchVectorEnv(NativeVectorEnv):
         sampled: values drawn at reset, name in `SAMPLED` to (num_envs,) array.
     """
 
-    privileged_size = 10
-
     def __init__(
         self,
         num_envs: int = 1,
@@ -194,10 +182,8 @@ class PegTouchVectorEnv(NativeVectorEnv):
         e_x, e_f = np.abs(self.error).T
         force = -c.weight_f * np.minimum(e_f, c.force_error_cap)
         terms = {"position": -c.weight_x * e_x, "force": force}
-        reward = terms["position"] + terms["force"]
-        truncated = self.steps >= c.horizon
-        ended = np.zeros(self.num_envs, dtype=bool)
-        return self._observe(), reward, ended, truncated, {"reward_terms": terms}
+        reward, ended = terms["position"] + terms["force"], np.zeros(self.num_envs, dtype=bool)
+        return self._observe(), reward, ended, self.steps >= c.horizon, {"reward_terms": terms}
 
     def transforms(self) -> tuple[Array, Array]:
         """T_y and T_a of the nominal in-contact model at the present x, (num_envs, 2, 2) each.
@@ -269,7 +255,7 @@ class PegTouchVectorEnv(NativeVectorEnv):
             columns = np.stack([self.signal, self.integral], axis=-1).reshape(-1, 4)
         return columns.astype(np.float32)
 
-    def _describe(self, info: dict[str, Any]) -> dict[str, Array32]:
+    def _describe(self) -> dict[str, Array32]:
         """What a critic may know, if it is wanted."""
         if not self._with_privileged:
             return {}

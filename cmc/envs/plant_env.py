@@ -8,15 +8,12 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cmc import plants
 from cmc.envs.vector import Array32, Mask, NativeVectorEnv, SingleEnv, Step
 from cmc.plants import Plant
-from cmc.theory.arrays import checked, count, number, refuse_uncallable
-
-Array = NDArray[np.float64]
-Reward = Callable[[Array, Array], Array]
+from cmc.theory.arrays import Array, checked, count, number, refuse_uncallable
 
 
 class PlantVectorEnv(NativeVectorEnv):
@@ -55,7 +52,7 @@ class PlantVectorEnv(NativeVectorEnv):
         h: float = 0.02,
         *,
         target: ArrayLike | None = None,
-        reward: Reward | None = None,
+        reward: Callable[[Array, Array], Array] | None = None,
         horizon: int = 500,
         substeps: int = 4,
         room: float = 10.0,

@@ -12,9 +12,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
-from cmc.theory.arrays import checked, count
+from cmc.theory.arrays import Array, checked, count
 
-Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Step = tuple[Array32, Array, Mask, Mask, dict[str, Any]]
@@ -79,7 +78,7 @@ class NativeVectorEnv(VectorEnv[Array32, ArrayLike, Any]):
     def _advance(self, actions: ArrayLike) -> Step:
         """One step of all: observations, reward, terminated, truncated, info."""
 
-    def _describe(self, info: dict[str, Any]) -> dict[str, Any]:
+    def _describe(self) -> dict[str, Any]:
         """What `info` says of the present states, after a start as well as after a step."""
         return {}
 
@@ -94,7 +93,7 @@ class NativeVectorEnv(VectorEnv[Array32, ArrayLike, Any]):
         self._seed(seed)
         self._ended = self._ended & ~mask
         obs, self._begun = self._begin(mask, options), True
-        return obs, self._describe({})
+        return obs, self._describe()
 
     def step(self, actions: ArrayLike) -> Step:
         """One step of every trajectory."""
@@ -107,11 +106,11 @@ class NativeVectorEnv(VectorEnv[Array32, ArrayLike, Any]):
             info = _each(info, lambda value: np.where(fresh, np.zeros((), value.dtype), value))
             terminated, truncated = terminated & ~fresh, truncated & ~fresh
         self._ended = ended = terminated | truncated
-        info = info | self._describe(info)
+        info = info | self._describe()
         if self.mode is AutoresetMode.SAME_STEP and ended.any():
             final = {"final_obs": obs, "_final_obs": ended, "_final_info": ended}
             obs = self._begin(ended, {})
-            info = info | final | {"final_info": info} | self._describe({})
+            info = info | final | {"final_info": info} | self._describe()
         return obs, reward, terminated, truncated, info
 
 

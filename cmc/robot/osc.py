@@ -32,10 +32,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmc.robot.panda import DOWN, JOINTS, READY
 from cmc.robot.tick import LAW, ROW, refresh, tick
-from cmc.theory.arrays import checked, count, number
+from cmc.theory.arrays import Array, checked, count, number
 from cmc.theory.composite import CompositeModel, composite
 
-Array = NDArray[np.float64]
 _STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
@@ -146,10 +145,8 @@ class Worlds:
         **more: Any,
     ) -> None:
         self.model, self.num = model, count("worlds", num)
-        if (
-            min(model.sensor_history[model.sensor(name).id][0] for name in _CONTACT.values())
-            < substeps
-        ):
+        remembered = [model.sensor_history[model.sensor(n).id][0] for n in _CONTACT.values()]
+        if min(remembered) < substeps:
             raise ValueError(f"model: wanted sensors with a history of {substeps} (`load_scene`)")
         self._law = _describe(model, gains, law, substeps=substeps, **more)
         self._hand, self._actions = model.body("hand").id, (num, JOINTS if more.get("joint") else 6)

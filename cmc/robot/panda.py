@@ -12,12 +12,10 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cmc.store import asset
-from cmc.theory.arrays import checked, number
-
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array, checked, number
 
 JOINTS = 7
 #: Modified Denavit-Hartenberg rows (a [m], d [m], alpha [rad]), one per joint.
@@ -143,11 +141,8 @@ def inverse_kinematics(
     tolerance = number("tolerance", tolerance, above=0.0)
     model = _bare_arm()
     data, hand = mujoco.MjData(model), model.body("hand").id
-    jac, error, offset = (
-        np.zeros((6, model.nv)),
-        np.zeros(6),
-        np.array([0.0, 0.0, number("tool", tool)]),
-    )
+    jac, error = np.zeros((6, model.nv)), np.zeros(6)
+    offset = np.array([0.0, 0.0, number("tool", tool)])
     q = np.clip(checked("q0", q0, "7"), LOWER, UPPER)
     for _ in range(100):
         data.qpos[:] = q

@@ -21,11 +21,9 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from cmc.robot.panda import JOINTS
-from cmc.theory.arrays import compiled
+from cmc.theory.arrays import Array, compiled
 
-Array = NDArray[np.float64]
 Record = NDArray[np.void]
-
 
 _FOLDER = Path(mujoco.__file__).parent
 _FOUND = [

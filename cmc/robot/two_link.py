@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import checked, increasing, number, refuse_uncallable, together
+from cmc.theory.arrays import Array, checked, increasing, number, refuse_uncallable, together
 
-Array = NDArray[np.float64]
 TorqueLaw = Callable[[float, Array, Array], Array]
 
 
@@ -127,11 +126,8 @@ def simulate(
     The torque `law(t, q, q')`, N m, is held between two times, each one Runge-Kutta step (RK4).
     """
     refuse_uncallable("law", law)
-    times, (start, speed) = (
-        increasing("times", times),
-        together(q=_pair("q", q, True), dq=_pair("dq", dq, True)),
-    )
-    path = [np.stack([start, speed])]
+    times = increasing("times", times)
+    path = [np.stack(together(q=_pair("q", q, True), dq=_pair("dq", dq, True)))]
     for t, h in zip(times, np.diff(times), strict=False):
         tau, state = _pair("law(t, q, dq)", law(float(t), *path[-1])), path[-1]
 
@@ -143,5 +139,5 @@ def simulate(
         k3 = rate(state + h / 2 * k2)
         k4 = rate(state + h * k3)
         path.append(state + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
-    moved = np.array(path)
-    return moved[:, 0], moved[:, 1]
+    angles, rates = np.swapaxes(path, 0, 1)
+    return angles, rates

@@ -26,17 +26,27 @@ _Arrays = dict[str, np.ndarray]
 _CURVE = ("label", "width", "alpha", "dash", "head")
 
 
-class PictureError(ValueError):
-    """Data that a layer cannot draw: an absent key, or an array of another shape."""
-
-
 @dataclass(frozen=True)
 class _Layer:
-    """One thing that a panel draws: how to fetch its data, and how it looks."""
+    """One thing that a panel draws: how it looks, and how `arrange` makes arrays of its sources."""
 
     kind: str
-    fetch: Callable[[Data], _Arrays]
     look: dict[str, Any]
+    sources: tuple[Source, ...] = ()
+    wanted: str = ""
+    arrange: Callable[..., _Arrays | None] = dict
+    name: str = ""
+
+    def fetch(self, data: Data) -> _Arrays:
+        """The arrays that are drawn; says which shapes were wanted and came."""
+        complex_too = self.kind == "points"
+        arrays = [_array(data, source, complex_too=complex_too) for source in self.sources]
+        made = self.arrange(*arrays)
+        if made is None:
+            came = " and ".join(str(array.shape) for array in arrays)
+            call = f"{self.name or self.kind}({', '.join(map(_name, self.sources))})"
+            raise ValueError(f"{call}: wanted {self.wanted}, got {came}")
+        return made
 
 
 @dataclass(frozen=True)
@@ -57,8 +67,8 @@ def lines(x: Source, y: Source, *, color: str | None = None, **look: Any) -> _La
         Y = Y[:, None] if Y.ndim == 1 else Y
         return {"x": X, "y": Y.T} if X.ndim == 1 and Y.ndim == 2 and len(X) == len(Y) else None
 
-    fetch = _fetch("lines", arrange, (x, y), "(m,) and (m, number)")
-    return _Layer("lines", fetch, _look(color, look, *_CURVE))
+    wanted = "(m,) and (m, number)"
+    return _Layer("lines", _look(color, look, *_CURVE), (x, y), wanted, arrange)
 
 
 def paths(p: Source, *, color: str | None = None, **look: Any) -> _Layer:
@@ -72,8 +82,8 @@ def paths(p: Source, *, color: str | None = None, **look: Any) -> _Layer:
         flat = P.ndim == 3 and P.shape[-1] >= 2
         return {"x": P[..., 0].T, "y": P[..., 1].T} if flat else None
 
-    fetch = _fetch("paths", arrange, (p,), "(time, number, 2)")
-    return _Layer("lines", fetch, _look(color, {"head": True, **look}, *_CURVE))
+    made = _look(color, {"head": True, **look}, *_CURVE)
+    return _Layer("lines", made, (p,), "(time, number, 2)", arrange, "paths")
 
 
 def points(p: Source, *, color: str | None = None, **look: Any) -> _Layer:
@@ -88,8 +98,8 @@ def points(p: Source, *, color: str | None = None, **look: Any) -> _Layer:
         flat = P.ndim in (2, 3) and P.shape[-1] == 2
         return {"x": P[..., 0], "y": P[..., 1]} if flat else None
 
-    fetch = _fetch("points", arrange, (p,), "complex numbers or (number, 2)")
-    return _Layer("points", fetch, _look(color, look, "label", "radius", "alpha", "marker"))
+    made = _look(color, look, "label", "radius", "alpha", "marker")
+    return _Layer("points", made, (p,), "complex numbers or (number, 2)", arrange)
 
 
 def band(x: Source, low: Source, high: Source, *, color: str | None = None, **look: Any) -> _Layer:
@@ -98,8 +108,8 @@ def band(x: Source, low: Source, high: Source, *, color: str | None = None, **lo
     def arrange(X: np.ndarray, L: np.ndarray, H: np.ndarray) -> _Arrays | None:
         return {"x": X, "y": L, "y2": H} if (len(X),) == X.shape == L.shape == H.shape else None
 
-    fetch = _fetch("band", arrange, (x, low, high), "(m,) thrice")
-    return _Layer("band", fetch, _look(color, {"alpha": 0.2, **look}, "label", "alpha"))
+    made = _look(color, {"alpha": 0.2, **look}, "label", "alpha")
+    return _Layer("band", made, (x, low, high), "(m,) thrice", arrange)
 
 
 def cells(M: Source) -> _Layer:
@@ -115,7 +125,7 @@ def cells(M: Source) -> _Layer:
         corners = {"x": np.array([0.5, columns + 0.5]), "y": np.array([0.5, rows + 0.5])}
         return {"values": A, **corners}
 
-    return _Layer("cells", _fetch("cells", arrange, (M,), "(rows, columns)"), {})
+    return _Layer("cells", {}, (M,), "(rows, columns)", arrange)
 
 
 def shade(
@@ -128,7 +138,7 @@ def shade(
     axis, strip = _one(x=x, y=y)
     span = [None if np.isinf(v) else float(v) for v in strip]
     made = _look(look.pop("color", "blue"), {"alpha": 0.1, **look}, "label", "alpha")
-    return _Layer("shade", lambda data: {}, {**made, "axis": axis, "span": span})
+    return _Layer("shade", {**made, "axis": axis, "span": span})
 
 
 def rule(*, x: float | str | None = None, y: float | str | None = None, **look: Any) -> _Layer:
@@ -137,9 +147,9 @@ def rule(*, x: float | str | None = None, y: float | str | None = None, **look: 
     `look`: `color`, `label`, `dash` (bool), `width` (px).
     """
     axis, where = _one(x=x, y=y)
-    fetch = _fetch("rule", lambda v: {"value": np.ravel(v)[:1]}, (where,), "a number")
     made = _look(look.pop("color", NEUTRAL), {"dash": True, **look}, "label", "dash", "width")
-    return _Layer("rule", fetch, {**made, "axis": axis})
+    look = {**made, "axis": axis}
+    return _Layer("rule", look, (where,), "a number", lambda v: {"value": np.ravel(v)[:1]})
 
 
 def panel(
@@ -161,10 +171,10 @@ def panel(
     vertical axis is logarithmic; `size` in CSS pixels.
     """
     if not layers:
-        raise PictureError("wanted at least one layer in the panel")
+        raise ValueError("wanted at least one layer in the panel")
     for name, given in (("xlim", xlim), ("ylim", ylim)):
         if given is not None and not (np.isfinite(given).all() and given[0] < given[1]):
-            raise PictureError(f"{name}: wanted two finite rising numbers, got {given}")
+            raise ValueError(f"{name}: wanted two finite rising numbers, got {given}")
     cycle = itertools.cycle(CYCLE)
     colored = [
         replace(layer, look={**layer.look, "color": next(cycle)})
@@ -182,10 +192,10 @@ def encode(panels: Sequence[Panel], data: Data, time: Source | None = None) -> d
     The entry `text` of `data`, if any, is the status line; `time` is that of the time cursor.
 
     Raises:
-        PictureError: if a key is absent or an array has another shape than its layer wants.
+        ValueError: if a key is absent or an array has another shape than its layer wants.
     """
     if not isinstance(data, Mapping):
-        raise PictureError(f"wanted a mapping of names to arrays, got {type(data).__name__}")
+        raise ValueError(f"wanted a mapping of names to arrays, got {type(data).__name__}")
     blocks: list[np.ndarray] = []
 
     def put(array: np.ndarray) -> dict[str, Any]:
@@ -236,36 +246,17 @@ def _fill(text: str, data: Data) -> str:
     try:
         parts[::2] = [part.format(**plain) for part in parts[::2]]
     except (KeyError, IndexError, ValueError, TypeError) as error:
-        raise PictureError(
-            f"cannot fill the title {text!r} from {sorted(data)}: {error}"
-        ) from error
+        raise ValueError(f"cannot fill the title {text!r} from {sorted(data)}: {error}") from error
     return "$".join(parts)
-
-
-def _fetch(
-    name: str, arrange: Callable[..., _Arrays | None], sources: tuple[Source, ...], wanted: str
-) -> Callable[[Data], _Arrays]:
-    """What reads the sources and arranges them, or says which shapes were wanted and came."""
-
-    def fetch(data: Data) -> _Arrays:
-        arrays = [_array(data, source, complex_too=name == "points") for source in sources]
-        made = arrange(*arrays)
-        if made is None:
-            came = " and ".join(str(array.shape) for array in arrays)
-            given = ", ".join(map(_name, sources))
-            raise PictureError(f"{name}({given}): wanted {wanted}, got {came}")
-        return made
-
-    return fetch
 
 
 def _array(data: Data, source: Source, *, complex_too: bool = False) -> np.ndarray:
     """The numbers that `source` names in `data`, or holds itself, as floats."""
     if isinstance(source, str) and source not in data:
-        raise PictureError(f"the callback returned no {source!r}, only {sorted(data)}")
+        raise ValueError(f"the callback returned no {source!r}, only {sorted(data)}")
     array = np.asarray(data[source] if isinstance(source, str) else source)
     if array.dtype.kind not in "biuf" + "c" * complex_too or array.size == 0:
-        raise PictureError(
+        raise ValueError(
             f"{_name(source)}: wanted numbers, got {array.dtype} of shape {array.shape}"
         )
     return array if array.dtype.kind == "c" else array.astype(float)
@@ -275,7 +266,7 @@ def _one(**given: Any) -> tuple[str, Any]:
     """The one axis that is given, and what."""
     found = [(axis, value) for axis, value in given.items() if value is not None]
     if len(found) != 1:
-        raise PictureError(f"wanted x=... or y=..., got {given}")
+        raise ValueError(f"wanted x=... or y=..., got {given}")
     return found[0]
 
 

@@ -64,10 +64,9 @@ def presets(
 
     `moving` are numbers of bodies, `trails` points (T, 3) by name.
     """
-    low, high = motion.low, motion.high
     goes = np.isin(motion.owner, [*moving, -1])  # what is soft moves, too
-    everything = _ball(low, high)
-    subject = _ball(low[0, goes], high[0, goes]) if goes.any() else everything
+    everything = _ball(motion.low, motion.high)
+    subject = _ball(motion.low[0, goes], motion.high[0, goes]) if goes.any() else everything
     places = motion.poses[:, moving, :3].astype(float)
     if not moving:
         soft = [cloth["corners"].mean(axis=1) for cloth in motion.cloths]

@@ -77,7 +77,7 @@ class _Socket(_Door, tornado.websocket.WebSocketHandler):
             stream.close()
 
 
-class LiveView:
+class LiveView(contextlib.AbstractContextManager["LiveView"]):
     """A scene in the browser that follows the program.
 
     The poses of `scene` are the starting ones, and cloths stay as they were. After `timeout`
@@ -135,9 +135,6 @@ class LiveView:
         with contextlib.suppress(RuntimeError):  # the loop may have stopped by itself
             self._loop.call_soon_threadsafe(self._stopping.cancel)
         self._thread.join(5.0)
-
-    def __enter__(self) -> LiveView:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -1,4 +1,4 @@
-"""Where everything of a model is along a trajectory; flexes, skins and tendons as triangles."""
+"""Where everything of a model is along a trajectory, flexes, skins and tendons among it."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from cmc.view.playback.shapes import hexadecimal, shown_rgba, visible
-from cmc.view.playback.textures import Array
+from cmc.view.playback.shapes import hexadecimal, own_rgba, shown_rgba, visible
+from cmc.view.playback.textures import Array, texture, texture_address
 
 _Soft = tuple[dict[str, Any], Callable[[mujoco.MjData], Array]]
 _SAMPLED = 24  # frames at which the extent of a motion is looked at
-_SIDES = 6  # of a tube around an edge or a tendon
 
 
 class Motion:
@@ -27,7 +26,8 @@ class Motion:
         low: lower corners (frames, things, 3), m, of boxes around all that is seen but planes, at
             some frames, the first among them; the upper ones are `high`, the things' bodies are
             `owner` (things,), -1 for what is soft.
-        cloths: flexes and tendons: faces, color, and `corners` (T, V, 3).
+        cloths: flexes and tendons: color, `corners` (T, V, 3), and `faces`; or, of cables and
+            tendons, the `radius` of tubes, each between two of the corners.
     """
 
     def __init__(
@@ -35,41 +35,35 @@ class Motion:
     ) -> None:
         self.model, self.data, frames = model, mujoco.MjData(model), len(rows)
         data, soft = self.data, [*_flexes(model, groups), *_tendons(model, groups)]
-        soft = [(look, place) for look, place in soft if look["opacity"] > 0 and len(look["faces"])]
-        self.poses = np.empty((frames, model.nbody, 7), dtype=np.float32)
-        self.sites = np.empty((frames, model.nsite, 3))
-        self.eyes = np.empty((frames, model.ncam, 3))
-        self.axes = np.empty((frames, model.ncam, 3, 3))
+        soft = [(look, place) for look, place in soft if look["opacity"] > 0]
         parts = [part for seen in visible(model, groups).values() for part in seen]
         flat = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         solid = [i for what, i in parts if what == "geom" and not flat[i]]
         sampled = set(np.linspace(0, frames - 1, _SAMPLED).round().astype(int).tolist())
-        boxes: list[Array] = []
-        corners: list[list[Array]] = [[] for _ in soft]
+        found, boxes = [], []
         for k in range(frames - 1, -1, -1):
             if spec is None:
                 data.qpos[:] = rows[k]
             else:
                 mujoco.mj_setState(model, data, rows[k], spec)
             mujoco.mj_kinematics(model, data)
-            self.poses[k, :, :3], self.poses[k, :, 3:] = data.xpos, data.xquat
-            self.sites[k] = data.site_xpos
-            if model.ncam or soft:
-                mujoco.mj_comPos(model, data)
-                mujoco.mj_camlight(model, data)
-                self.eyes[k], self.axes[k] = data.cam_xpos, data.cam_xmat.reshape(-1, 3, 3)
-            if soft:
-                mujoco.mj_flex(model, data)
-                mujoco.mj_tendon(model, data)
-            for (_, place), found in zip(soft, corners, strict=True):
-                found.append(place(data))
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_camlight(model, data)
+            mujoco.mj_flex(model, data)
+            mujoco.mj_tendon(model, data)
+            poses = np.c_[data.xpos, data.xquat].astype(np.float32)
+            cameras = data.cam_xpos.copy(), data.cam_xmat.reshape(-1, 3, 3).copy()
+            corners = [place(data) for _, place in soft]
+            found.append((poses, data.site_xpos.copy(), *cameras, *corners))
             if k in sampled:
-                boxes.append(_boxes(model, data, solid, [found[-1] for found in corners]))
+                boxes.append(_boxes(model, data, solid, corners))
+        paths = [np.array(path[::-1]) for path in zip(*found, strict=True)]
+        self.poses, self.sites, self.eyes, self.axes = paths[:4]
         self.low, self.high = np.swapaxes(boxes[::-1], 0, 1)
         self.owner = np.array([*model.geom_bodyid[solid], *[-1 for _ in soft]], dtype=int)
         self.cloths = [
-            {**look, "corners": np.array(found[::-1], dtype=np.float32)}
-            for (look, _), found in zip(soft, corners, strict=True)
+            {**look, "corners": path.astype(np.float32)}
+            for (look, _), path in zip(soft, paths[4:], strict=True)
         ]
 
     def point(self, name: str) -> Array:
@@ -98,15 +92,13 @@ def skins(model: mujoco.MjModel, groups: Sequence[int]) -> list[dict[str, Any]]:
     """All visible skins: corners (V, 3) at rest, and what bodies do to them; the page computes it.
 
     A corner is the weighted mean of where each of its bones alone would take it. A bone is a
-    `body`, its pose `rest` (7,), and `index` and `weight` of the corners that it moves.
+    `body`, its pose `rest` (7,), and `index` and `weight` of the corners that it moves. A skin with
+    texture coordinates `uv` (V, 2) has the address of its texture as `map`.
     """
     found = []
-    for i in np.flatnonzero(np.isin(model.skin_group, groups)):
-        first, face, bone = (
-            int(getattr(model, f"skin_{n}adr")[i]) for n in ("vert", "face", "bone")
-        )
-        bones = []
-        for b in range(bone, bone + int(model.skin_bonenum[i])):
+    for i in np.flatnonzero(np.isin(model.skin_group, groups)).tolist():
+        first, count, bones = model.skin_vertadr[i], model.skin_vertnum[i], []
+        for b in range(model.skin_boneadr[i], model.skin_boneadr[i] + model.skin_bonenum[i]):
             start = model.skin_bonevertadr[b]
             rows = slice(start, start + model.skin_bonevertnum[b])
             pose = np.r_[model.skin_bonebindpos[b], model.skin_bonebindquat[b]].astype(float)
@@ -114,78 +106,60 @@ def skins(model: mujoco.MjModel, groups: Sequence[int]) -> list[dict[str, Any]]:
             weight = model.skin_bonevertweight[rows].astype(np.float32)
             placed = {"body": int(model.skin_bonebodyid[b]), "rest": pose.tolist()}
             bones.append({**placed, "index": index, "weight": weight})
-        look = _surface(model, "skin", int(i), model.skin_face[face : face + model.skin_facenum[i]])
-        rest = model.skin_vert[first : first + model.skin_vertnum[i]].astype(np.float32)
+        faces = model.skin_face[model.skin_faceadr[i] :][: model.skin_facenum[i]]
+        look = {**_look(model, "skin", i), "faces": faces.astype(np.uint32)}
+        material, start = int(model.skin_matid[i]), int(model.skin_texcoordadr[i])
+        if start >= 0 and texture(model, material) is not None:
+            color = hexadecimal(own_rgba(model, model.skin_rgba[i], material))
+            uv = model.skin_texcoord[start : start + count].astype(np.float32)
+            look |= {"color": color, "uv": uv, "map": texture_address(model, material)}
+        rest = model.skin_vert[first : first + count].astype(np.float32)
         found.append({**look, "corners": rest, "bones": bones})
     return [skin for skin in found if skin["opacity"] > 0]
 
 
-def _surface(model: mujoco.MjModel, what: str, i: int, faces: NDArray[Any]) -> dict[str, Any]:
-    """Name, color and triangles of something soft."""
+def _look(model: mujoco.MjModel, what: str, i: int) -> dict[str, Any]:
+    """Name and color of something soft."""
     material = int(getattr(model, f"{what}_matid")[i])
     rgba = shown_rgba(model, getattr(model, f"{what}_rgba")[i], material)
-    look = {"name": f"{what} {i}", "color": hexadecimal(rgba), "opacity": rgba[3]}
-    return {**look, "faces": faces.astype(np.uint32)}
+    return {"name": f"{what} {i}", "color": hexadecimal(rgba), "opacity": float(rgba[3])}
 
 
 def _flexes(model: mujoco.MjModel, groups: Sequence[int]) -> Iterator[_Soft]:
-    """Flexes: the surface of cloths and bodies, and tubes around the edges of cables."""
-    for i in np.flatnonzero(np.isin(model.flex_group, groups)):
-        first, dim = model.flex_vertadr[i], int(model.flex_dim[i])
-        rows = slice(first, first + model.flex_vertnum[i])
+    """Flexes: the surface of cloths and bodies, and the edges of cables."""
+    for i in np.flatnonzero(np.isin(model.flex_group, groups)).tolist():
+        dim = int(model.flex_dim[i])
         if dim == 3:  # of a body only its skin is seen
             first, count, width = model.flex_shelldataadr[i], model.flex_shellnum[i], 3
             elements = model.flex_shell[first : first + 3 * count].reshape(-1, 3)
         else:
             first, count, width = model.flex_elemdataadr[i], model.flex_elemnum[i], dim + 1
             elements = model.flex_elem[first : first + width * count].reshape(-1, width)
-        radius = float(model.flex_radius[i]) if dim == 1 else None
-        faces = elements if dim > 1 else _tube_faces(len(elements))
-        yield _surface(model, "flex", int(i), faces), partial(_flex, rows, elements.T, radius)
+        look, index = _look(model, "flex", i), elements.ravel()
+        if dim > 1:
+            look["faces"], index = elements.astype(np.uint32), np.arange(model.flex_vertnum[i])
+        else:
+            look["radius"] = float(model.flex_radius[i])
+        yield look, partial(_flex, model.flex_vertadr[i] + index)
 
 
-def _flex(rows: slice, ends: Any, radius: float | None, data: mujoco.MjData) -> Array:
-    corners = data.flexvert_xpos[rows].copy()
-    return corners if radius is None else _tube(corners[ends[0]], corners[ends[1]], radius)
+def _flex(rows: NDArray[np.integer], data: mujoco.MjData) -> Array:
+    return data.flexvert_xpos[rows]
 
 
 def _tendons(model: mujoco.MjModel, groups: Sequence[int]) -> Iterator[_Soft]:
-    """Spatial tendons as tubes, from where they are fixed over what they wrap."""
+    """Spatial tendons, from where they are fixed over what they wrap."""
     spatial = model.wrap_type[model.tendon_adr] != mujoco.mjtWrap.mjWRAP_JOINT
-    for i in np.flatnonzero(spatial & np.isin(model.tendon_group, groups)):
-        most, radius = 2 * int(model.tendon_num[i]), float(model.tendon_width[i])
-        yield (
-            _surface(model, "tendon", int(i), _tube_faces(most)),
-            partial(_tendon, int(i), most, radius),
-        )
+    for i in np.flatnonzero(spatial & np.isin(model.tendon_group, groups)).tolist():
+        look = {**_look(model, "tendon", i), "radius": float(model.tendon_width[i])}
+        yield look, partial(_tendon, i, 2 * int(model.tendon_num[i]))
 
 
-def _tendon(i: int, most: int, radius: float, data: mujoco.MjData) -> Array:
+def _tendon(i: int, most: int, data: mujoco.MjData) -> Array:
+    """Both ends of at most so many straight pieces, (2 most, 3); absent pieces have no length."""
     rows = slice(data.ten_wrapadr[i], data.ten_wrapadr[i] + data.ten_wrapnum[i])
     points, thing = data.wrap_xpos.reshape(-1, 3)[rows], data.wrap_obj.ravel()[rows]
     joined = np.flatnonzero((thing[:-1] != -2) & (thing[1:] != -2))  # -2: a pulley
-    ends = np.full((2, most, 3), points[0])
-    ends[0, : len(joined)], ends[1, : len(joined)] = points[joined], points[joined + 1]
-    return _tube(ends[0], ends[1], radius)
-
-
-def _tube(a: Array, b: Array, radius: float) -> Array:
-    """Corners (S * 12, 3) of six-sided tubes around the edges from a to b, both (S, 3)."""
-    along = b - a
-    length = np.linalg.norm(along, axis=1, keepdims=True)
-    along = np.divide(along, length, out=np.tile([0.0, 0, 1], (len(a), 1)), where=length > 0)
-    helper = np.eye(3)[np.argmin(np.abs(along), axis=1)]
-    across = np.cross(along, helper)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
-    ring = np.cos(angle)[:, None] * across[:, None]
-    ring = radius * (ring + np.sin(angle)[:, None] * np.cross(along, across)[:, None])
-    return np.concatenate([a[:, None] + ring, b[:, None] + ring], axis=1).reshape(-1, 3)
-
-
-def _tube_faces(count: int) -> NDArray[np.integer]:
-    """Triangles (count * 12, 3) of `count` tubes."""
-    k = np.arange(_SIDES)
-    n = (k + 1) % _SIDES
-    one = np.concatenate([np.c_[k, n, k + _SIDES], np.c_[n, n + _SIDES, k + _SIDES]])
-    return (one + 2 * _SIDES * np.arange(count)[:, None, None]).reshape(-1, 3)
+    ends = np.tile(points[0], (most, 2, 1))
+    ends[: len(joined)] = np.stack([points[joined], points[joined + 1]], axis=1)
+    return ends.reshape(-1, 3)

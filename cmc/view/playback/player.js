@@ -24,11 +24,13 @@ const viewer = new MeshCat.Viewer(element("div", "canvas", pane));
 const resize = viewer.set_3d_pane_size.bind(viewer);
 viewer.set_3d_pane_size = (width, height) => resize(  // the bar below must not hide the scene
   width ?? pane.clientWidth, height ?? window.innerHeight - byId("bar").offsetHeight);
-// A mesh that is used again comes as a stand-in with the first one's uuid.
-const shapes = {}, place = viewer.set_object.bind(viewer);
+// A mesh or texture that is used again comes as a stand-in with the first one's uuid.
+const first = {}, place = viewer.set_object.bind(viewer);
 viewer.set_object = (path, object) => {
+  const once = (thing) => first[thing.uuid] ??= thing;
   object.traverse((part) => {
-    if (part.geometry) part.geometry = shapes[part.geometry.uuid] ??= part.geometry;
+    if (part.geometry) part.geometry = once(part.geometry);
+    if (part.material?.map) part.material.map = once(part.material.map);
   });
   place(path, object);
 };
@@ -99,31 +101,45 @@ function named(object, name) {
   return object;
 }
 
-// A trail is a thin tube (seen from near) and a line (seen from far), both cut at the current time.
-function makeTrail(item) {
-  const at = rowReader(item.points), sides = 6, points = [], corners = [], index = [];
-  for (let k = 0; k <= last; k++) points.push(at(k));
-  const axis = new THREE.Vector3(), across = new THREE.Vector3(), over = new THREE.Vector3();
-  for (let k = 0; k < last; k++) {
-    axis.subVectors(points[k + 1], points[k]);
-    across.set(axis.z, axis.x, axis.y).cross(axis).normalize();
-    over.crossVectors(axis, across).normalize();
-    for (const end of [points[k], points[k + 1]]) {
-      for (let s = 0; s < sides; s++) {
-        const c = item.radius * Math.cos(2 * Math.PI * s / sides);
-        const d = item.radius * Math.sin(2 * Math.PI * s / sides);
-        corners.push(end.x + c * across.x + d * over.x, end.y + c * across.y + d * over.y,
-          end.z + c * across.z + d * over.z);
-      }
-    }
-    for (let s = 0; s < sides; s++) {
-      const a = 2 * sides * k + s, b = 2 * sides * k + (s + 1) % sides;
-      index.push(a, b, a + sides, b, b + sides, a + sides);
+// Six-sided tubes, each between two points that follow each other in `ends`, as triangles.
+const SIDES = 6;
+function tubeFaces(count) {
+  const faces = [];
+  for (let k = 0; k < count; k++) {
+    for (let s = 0; s < SIDES; s++) {
+      const a = 2 * SIDES * k + s, b = 2 * SIDES * k + (s + 1) % SIDES;
+      faces.push(a, b, a + SIDES, b, b + SIDES, a + SIDES);
     }
   }
-  const tube = new THREE.BufferGeometry();
-  tube.setAttribute("position", new THREE.Float32BufferAttribute(corners, 3));
-  tube.setIndex(index);
+  return Uint32Array.from(faces);
+}
+function tubeCorners(ends, radius, corners) {
+  const axis = new THREE.Vector3(), across = new THREE.Vector3(), over = new THREE.Vector3();
+  for (let k = 0, at = 0; k < ends.length; k += 6) {
+    axis.set(ends[k + 3] - ends[k], ends[k + 4] - ends[k + 1], ends[k + 5] - ends[k + 2]);
+    const size = axis.toArray().map(Math.abs), least = size.indexOf(Math.min(...size));
+    across.set(0, 0, 0).setComponent(least, 1).cross(axis).normalize();
+    over.crossVectors(axis, across).normalize();
+    for (const end of [k, k + 3]) {
+      for (let s = 0; s < SIDES; s++) {
+        const c = radius * Math.cos(2 * Math.PI * s / SIDES);
+        const d = radius * Math.sin(2 * Math.PI * s / SIDES);
+        for (let i = 0; i < 3; i++) {
+          corners[at++] = ends[end + i] + c * across.getComponent(i) + d * over.getComponent(i);
+        }
+      }
+    }
+  }
+}
+// A trail is a thin tube (seen from near) and a line (seen from far), both cut at the current time.
+function makeTrail(item) {
+  const at = rowReader(item.points), points = [], ends = [];
+  for (let k = 0; k <= last; k++) points.push(at(k));
+  for (let k = 0; k < last; k++) ends.push(...points[k].toArray(), ...points[k + 1].toArray());
+  const tube = new THREE.BufferGeometry(), corners = new Float32Array(6 * SIDES * last);
+  tubeCorners(ends, item.radius, corners);
+  tube.setAttribute("position", new THREE.BufferAttribute(corners, 3));
+  tube.setIndex(new THREE.BufferAttribute(tubeFaces(last), 1));
   tube.computeVertexNormals();
   const line = new THREE.BufferGeometry().setFromPoints(points);
   const group = named(new THREE.Group(), item.name);
@@ -132,7 +148,7 @@ function makeTrail(item) {
   group.add(new THREE.Line(line, new THREE.LineBasicMaterial({ color: item.color })));
   group.traverse((part) => { part.frustumCulled = false; });
   return { update(frame) {
-    tube.setDrawRange(0, 6 * sides * frame);
+    tube.setDrawRange(0, 6 * SIDES * frame);
     line.setDrawRange(0, frame + 1);
   } };
 }
@@ -189,13 +205,19 @@ function makeLabel(item) {
   } };
 }
 // Triangles whose corners move: the corners, and what to call when they have.
-function makeSurface(item, count) {
+function makeSurface(item, faces, count) {
   const shape = new THREE.BufferGeometry(), corners = new Float32Array(count);
   shape.setAttribute("position", new THREE.BufferAttribute(corners, 3));
-  shape.setIndex(new THREE.BufferAttribute(unpack(item.faces, Uint32Array), 1));
-  const mesh = named(new THREE.Mesh(shape, new THREE.MeshPhongMaterial({
+  shape.setIndex(new THREE.BufferAttribute(faces, 1));
+  const look = new THREE.MeshPhongMaterial({
     color: item.color, opacity: item.opacity, transparent: item.opacity < 1,
-    side: THREE.DoubleSide, shininess: 20, specular: 0x222222 })), item.name);
+    side: THREE.DoubleSide, shininess: 20, specular: 0x222222 });
+  if (item.map) {
+    shape.setAttribute("uv", new THREE.BufferAttribute(unpack(item.uv, Float32Array), 2));
+    look.map = new THREE.TextureLoader().load(item.map, () => viewer.set_dirty());
+    look.map.wrapS = look.map.wrapT = THREE.RepeatWrapping;
+  }
+  const mesh = named(new THREE.Mesh(shape, look), item.name);
   mesh.castShadow = mesh.receiveShadow = true;
   mesh.frustumCulled = false;
   return [corners, () => {
@@ -206,7 +228,8 @@ function makeSurface(item, count) {
 // A skin: each corner is the weighted mean of where its bones alone would take it.
 function makeSkin(item) {
   const rest = unpack(item.corners, Float32Array);
-  const [corners, done] = makeSurface(item, rest.length);
+  const faces = unpack(item.faces, Uint32Array);
+  const [corners, done] = makeSurface(item, faces, rest.length);
   const bones = item.bones.map((bone) => ({
     object: moving.objects[bone.body], index: unpack(bone.index, Uint32Array),
     weight: unpack(bone.weight, Float32Array), back: new THREE.Matrix4().compose(
@@ -230,10 +253,13 @@ function makeSkin(item) {
     done();
   } };
 }
-// A cloth or a tendon: corners as shares of a box, 16 bits each.
+// A cloth, or tubes of a radius: corners, or ends of tubes, as shares of a box, 16 bits each.
 function makeCloth(item) {
   const shares = unpack(item.shares, Uint16Array), width = 3 * item.count;
-  const frames = shares.length / width, [corners, done] = makeSurface(item, width);
+  const frames = shares.length / width, tubes = "radius" in item;
+  const faces = tubes ? tubeFaces(item.count / 2) : unpack(item.faces, Uint32Array);
+  const [corners, done] = makeSurface(item, faces, tubes ? SIDES * width : width);
+  const places = tubes ? new Float32Array(width) : corners;
   let shown = -1;
   return { update(frame, share) {
     if (shown === frame + share || (frames === 1 && shown >= 0)) return;
@@ -241,8 +267,9 @@ function makeCloth(item) {
     const i = width * Math.min(frame, frames - 1), j = width * Math.min(frame + 1, frames - 1);
     for (let k = 0; k < width; k++) {
       const value = shares[i + k] + share * (shares[j + k] - shares[i + k]);
-      corners[k] = item.low[k % 3] + item.side[k % 3] * value / 65535;
+      places[k] = item.low[k % 3] + item.side[k % 3] * value / 65535;
     }
+    if (tubes) tubeCorners(places, item.radius, corners);
     done();
   } };
 }

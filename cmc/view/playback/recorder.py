@@ -249,16 +249,15 @@ def _checked(
 ) -> tuple[Array, Array, int | None]:
     """Times, rows of states, and the `mjtState` they follow (None: joint positions)."""
     time, rows = np.asarray(times, dtype=float), np.asarray(states, dtype=float)
-    sizes = {int(mujoco.mj_stateSize(model, s)): int(s) for s in reversed(_STATES)}
-    if rows.ndim != 2 or (rows.shape[1] != model.nq and rows.shape[1] not in sizes):
-        raise ValueError(
-            f"states must have shape (T, {model.nq}) for joint positions or (T, n) with n in "
-            f"{sorted(sizes)} for full states, got {rows.shape}"
-        )
-    if time.shape != (len(rows),) or len(rows) == 0:
-        raise ValueError(f"times must have shape ({len(rows)},) and one frame, got {time.shape}")
     if not (np.isfinite(time).all() and np.isfinite(rows).all()):
         raise ValueError("states and times must be finite")
-    if np.any(np.diff(time) <= 0.0):
-        raise ValueError("times must increase strictly")
-    return time, rows, None if rows.shape[1] == model.nq else sizes[rows.shape[1]]
+    if time.ndim != 1 or len(time) == 0 or np.any(np.diff(time) <= 0.0):
+        raise ValueError(f"times must be at least one, and increase strictly, got {time}")
+    full = {int(mujoco.mj_stateSize(model, s)): int(s) for s in reversed(_STATES)}
+    specs: dict[int, int | None] = {**full, model.nq: None}
+    if rows.ndim != 2 or len(rows) != len(time) or rows.shape[1] not in specs:
+        raise ValueError(
+            f"states must have shape ({len(time)}, n), a row for each time, with n = {model.nq} "
+            f"for joint positions or in {sorted(full)} for full states, got {rows.shape}"
+        )
+    return time, rows, specs[rows.shape[1]]

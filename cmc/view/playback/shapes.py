@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 
 from cmc.view.playback.textures import Array, box, plane, texture, texture_address
 
-_Rgba = tuple[float, float, float, float]
 _Triangles = tuple[Array, NDArray[np.integer], Array | None]  # vertices, faces, texture coordinates
 
 _G = mujoco.mjtGeom
 _Y_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 _DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
 _MESHES = (_G.mjGEOM_MESH, _G.mjGEOM_SDF)
+_OPEN = (_G.mjGEOM_PLANE, _G.mjGEOM_HFIELD)  # seen from both sides; MuJoCo hides meshes' insides
+_STAND_IN = "data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAA="  # of a texture sent before
 
 
 def draw(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[int]) -> list[bytes]:
@@ -33,7 +34,7 @@ def draw(model: mujoco.MjModel, data: mujoco.MjData, groups: Sequence[int]) -> l
     What has no counterpart is left out and named in a warning.
     """
     commands: list[bytes] = []
-    known: set[str] = set()
+    known: dict[str, str] = {}
     paths = body_paths(model)
 
     def send(kind: str, path: str, **more: Any) -> None:
@@ -86,31 +87,34 @@ def transform(position: Array, quaternion: Array) -> Array:
     return matrix
 
 
-def shown_rgba(model: mujoco.MjModel, rgba: Array, material: int) -> _Rgba:
-    """The own color, or the material's where that is the default, times the texture's mean."""
-    if material >= 0 and tuple(rgba) == _DEFAULT_RGBA:
-        rgba = model.mat_rgba[material]
-    pixels = texture(model, material)
-    if pixels is not None:
-        step = max(1, pixels.shape[1] // 128)
-        rgba = rgba * [*(pixels[::step, ::step].mean(axis=(0, 1)) / 255), 1]
-    r, g, b, a = np.clip(rgba, 0.0, 1.0).tolist()
-    return r, g, b, a
+def own_rgba(model: mujoco.MjModel, rgba: Array, material: int) -> Array:
+    """The own color, or the material's where that is the default; a texture is multiplied by it."""
+    default = material >= 0 and tuple(rgba) == _DEFAULT_RGBA
+    return np.clip(model.mat_rgba[material] if default else rgba, 0.0, 1.0)
 
 
-def hexadecimal(rgba: _Rgba) -> int:
+def shown_rgba(model: mujoco.MjModel, rgba: Array, material: int) -> Array:
+    """The same times the texture's mean, for what no texture is mapped on."""
+    pixels, rgba = texture(model, material), own_rgba(model, rgba, material)
+    if pixels is None:
+        return rgba
+    step = max(1, pixels.shape[1] // 128)
+    return rgba * [*(pixels[::step, ::step].mean(axis=(0, 1)) / 255), 1]
+
+
+def hexadecimal(rgba: Array) -> int:
     """A color as 0xRRGGBB."""
-    r, g, b = (round(255 * c) for c in rgba[:3])
-    return (r << 16) + (g << 8) + b
+    return int.from_bytes(round(255 * float(c)) for c in rgba[:3])
 
 
 def _three_object(
-    model: mujoco.MjModel, what: str, index: int, known: set[str]
+    model: mujoco.MjModel, what: str, index: int, known: dict[str, str]
 ) -> tuple[dict[str, Any], Array]:
     """A geom or site as three.js reads it from JSON, and its transform in its body's frame.
 
-    Textures are mapped on geoms. Of a mesh in `known` only the uuid is sent. The uuids are made of
-    names, so that the same recording is the same file. A type without a counterpart is refused.
+    Textures are mapped on geoms. Of a mesh or texture in `known` only the uuid is sent. The uuids
+    are made of names, so that the same recording is the same file. A type without a counterpart is
+    refused.
     """
 
     def get(field: str) -> Any:
@@ -118,9 +122,10 @@ def _three_object(
 
     name, kind, size = f"{what}{index}", _G(get("type")), get("size")
     material, data = (int(get("matid")), int(get("dataid"))) if what == "geom" else (-1, -1)
-    rgba, place = shown_rgba(model, get("rgba"), get("matid")), transform(get("pos"), get("quat"))
     found, scale = _triangles(model, kind, size, material, data), [1.0, 1.0, 1.0]
     mapped = found is not None and found[2] is not None
+    rgba = (own_rgba if mapped else shown_rgba)(model, get("rgba"), get("matid"))
+    place = transform(get("pos"), get("quat"))
     shared = found is not None and kind in _MESHES and not mapped
     uuid = f"mesh{data}" if shared else f"shape {name}"
     if found is None:
@@ -129,13 +134,10 @@ def _three_object(
         shape = {"type": "BoxGeometry", "width": 0, "height": 0, "depth": 0}
     else:
         shape = _buffer(*found)
-    known |= {uuid} if shared else set()
+    known |= {uuid: uuid} if shared else {}
     if kind in (_G.mjGEOM_CYLINDER, _G.mjGEOM_CAPSULE):
         place = place @ _Y_TO_Z
-    if mapped:
-        r, g, b = model.mat_rgba[material, :3].tolist()
-        rgba = (r, g, b, rgba[3])
-    look = {"uuid": f"mat {name}", **_material(kind, rgba, sides=0 if found is None else 2)}
+    look = {"uuid": f"mat {name}", **_material(kind, rgba, sides=2 if kind in _OPEN else 0)}
     ids = {"uuid": f"mesh {name}", "geometry": uuid, "material": look["uuid"]}
     matrix = np.diag([*scale, 1.0]).ravel().tolist()
     whole: dict[str, Any] = {
@@ -145,25 +147,28 @@ def _three_object(
         "object": {**ids, "type": "Mesh", "matrix": matrix},
     }
     if mapped:
-        look["map"], image = f"map {name}", f"image {name}"
+        url, image = texture_address(model, material), f"image {name}"
+        look["map"] = known.setdefault(url, f"map {name}")
         wrap = {"wrap": [1000, 1000], "repeat": [1, 1]}
         whole["textures"] = [{"uuid": look["map"], **wrap, "image": image}]
-        whole["images"] = [{"uuid": image, "url": texture_address(model, material)}]
+        sent = url if look["map"] == f"map {name}" else _STAND_IN
+        whole["images"] = [{"uuid": image, "url": sent}]
     return whole, place
 
 
-def _material(kind: mujoco.mjtGeom, rgba: _Rgba, sides: int) -> dict[str, Any]:
+def _material(kind: mujoco.mjtGeom, rgba: Array, sides: int) -> dict[str, Any]:
     """A three.js material; `sides` is 2 for both sides of open shapes."""
+    opacity = float(rgba[3])
     return {
         "type": "MeshPhongMaterial",
         "color": hexadecimal(rgba),
-        "opacity": rgba[3],
-        "transparent": rgba[3] < 1.0,
+        "opacity": opacity,
+        "transparent": opacity < 1.0,
         "side": sides,
         "shininess": 35,
         "specular": 0x2A2A2A,
         "flatShading": kind in (*_MESHES, _G.mjGEOM_BOX),
-        "depthWrite": rgba[3] == 1.0,  # what lies behind a see-through wall is seen from every side
+        "depthWrite": opacity == 1.0,  # what lies behind a see-through wall is seen from every side
         "polygonOffset": kind == _G.mjGEOM_PLANE,  # lines drawn on a floor stay visible
         "polygonOffsetFactor": 0,
         "polygonOffsetUnits": 4,

@@ -78,8 +78,7 @@ def box(half: Array, repeat: Array, uniform: bool, cube: bool) -> _Triangles:
     vertices, faces, uv = np.empty((6, 4, 3)), np.empty((6, 2, 3), dtype=int), np.empty((6, 4, 2))
     for side in range(6):
         axis, sign = side // 2, 1 - 2 * (side % 2)
-        vertices[side][:, axis] = sign
-        vertices[side][:, [k for k in range(3) if k != axis]] = _SQUARE
+        vertices[side] = np.insert(_SQUARE, axis, sign, axis=1)
         outwards = np.linalg.det(vertices[side, :3]) > 0
         order = [[0, 1, 2], [0, 2, 3]] if outwards else [[0, 2, 1], [0, 3, 2]]
         faces[side] = np.array(order) + 4 * side
