@@ -21,10 +21,10 @@ from cmc.learning.ppo import (
     PPO,
     PPOConfig,
     Rollout,
-    clip_gradients,
+    _clip_gradients,
+    _shuffle,
     collect,
     generalised_advantage,
-    shuffle,
     surrogate_gradient,
 )
 from cmc.policies import (
@@ -90,7 +90,7 @@ def test_advantage_is_the_sum_of_discounted_errors_up_to_the_end():
 
 def test_rows_are_shuffled_a_seed_at_a_time():
     data = torch.arange(2 * 6).reshape(2, 6, 1).repeat(1, 1, 3)
-    mixed = shuffle(data, [np.random.default_rng(0), np.random.default_rng(1)])
+    mixed = _shuffle(data, [np.random.default_rng(0), np.random.default_rng(1)])
     assert torch.equal(mixed[..., 0].sort(1).values, data[..., 0])
     assert torch.equal(mixed[..., 0], mixed[..., 2])
     assert not torch.equal(mixed, data)
@@ -100,7 +100,7 @@ def test_gradients_are_clipped_a_seed_at_a_time():
     small, large = torch.full((2, 3, 2), 0.01), torch.full((2, 5), 0.01)
     large[1] = 100.0
     before = torch.cat([small[1].flatten(), large[1]])
-    clip_gradients([small, None, large], 2, 0.5)
+    _clip_gradients([small, None, large], 2, 0.5)
     assert torch.equal(small[0], torch.full((3, 2), 0.01))
     assert torch.equal(large[0], torch.full((5,), 0.01))
     after = torch.cat([small[1].flatten(), large[1]])

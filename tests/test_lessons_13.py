@@ -208,9 +208,9 @@ def test_the_prices_are_the_torques_of_the_mechanisms():
     arm = TwoLinkArm(gravity=0.0)
     q, dq = [0.3, np.pi / 2] - e, -e_dot
     wanted = (arm.inertia(q) @ p[..., None])[..., 0] + arm.bias(q, dq)
-    found = composition.arm_torque(*(torch.as_tensor(x) for x in (e, e_dot, p)))
+    found = composition._arm_torque(*(torch.as_tensor(x) for x in (e, e_dot, p)))
     np.testing.assert_allclose(found, wanted, atol=1e-9)
-    tau = composition.pendulum_torque(*(torch.as_tensor(x[:, :1]) for x in (e, e_dot, p)))
+    tau = composition._pendulum_torque(*(torch.as_tensor(x[:, :1]) for x in (e, e_dot, p)))
     np.testing.assert_allclose(15 * np.sin(-e[:, :1]) + 3 * tau.numpy(), p[:, :1])  # -e'' = p
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from cmc.envs.plant_env import PlantVectorEnv
 from cmc.envs.vector import Array32, Mask, NativeVectorEnv, Seed, Step
-from cmc.theory.arrays import Array, checked, number, refuse_uncallable
+from cmc.theory.arrays import Array, checked, need, number
 from cmc.theory.auxiliary import AuxiliarySpace
 from cmc.theory.tracking import Tracker
 
@@ -65,9 +65,9 @@ class AuxiliarySpaceWrapper(gym.Wrapper[Array32, Any, Any, Any]):
             raise ValueError(f"env: wanted flat commands, got {env.action_space}")
         if (model is None) == (transforms is None):
             raise TypeError("wanted either a model or transforms")
-        refuse_uncallable("error", error)
+        need(callable(error), "error", "a function", error)
         if model is not None:
-            refuse_uncallable("model", model)
+            need(callable(model), "model", "a function", model)
         self.n, self.h = env.action_space.shape[0], number("h", h, above=0.0)
         self.error, self.model, self.transforms = error, model, transforms
         self._inner, self._seen = env.action_space, slice(None, None, 1 if integral else 2)

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cmc.envs.panda_task import PandaTask
 from cmc.envs.vector import Array32, Mask, NativeVectorEnv, Seed, SingleEnv, Step
-from cmc.theory.arrays import Array, checked, refuse_uncallable
+from cmc.theory.arrays import Array, checked, need
 
 ACTION_MODES = ("two_level", "low", "high")
 
@@ -47,7 +47,7 @@ class PandaVectorEnv(NativeVectorEnv):
         if action_mode not in ACTION_MODES:
             raise ValueError(f"action_mode must be one of {ACTION_MODES}, got {action_mode!r}")
         if low_level is not None:
-            refuse_uncallable("low_level", low_level)
+            need(callable(low_level), "low_level", "a function", low_level)
             if action_mode != "high" or task.config.command == "joint":
                 raise ValueError('low_level goes with action_mode "high" and a pose command only')
         self.task, self.action_mode, self._low_level = task, action_mode, low_level

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from cmc import plants
 from cmc.envs.vector import Array32, Mask, NativeVectorEnv, SingleEnv, Step
 from cmc.plants import Plant
-from cmc.theory.arrays import Array, checked, count, number, refuse_uncallable
+from cmc.theory.arrays import Array, checked, count, need, number
 
 
 class PlantVectorEnv(NativeVectorEnv):
@@ -71,7 +71,7 @@ class PlantVectorEnv(NativeVectorEnv):
         command = spaces.Box(p.u_low.astype(np.float32), p.u_high.astype(np.float32))
         super().__init__(num_envs, seen, command, autoreset_mode, render_mode)
         self._reward = self._quadratic if reward is None else reward
-        refuse_uncallable("reward", self._reward)
+        need(callable(self._reward), "reward", "a function", self._reward)
         self.y, self.u = np.tile(middle, (num_envs, 1)), np.zeros((num_envs, p.n))
         self.steps = np.zeros(num_envs, dtype=int)
         if (shape := np.shape(p.f(self.y, self.u))) != self.y.shape:

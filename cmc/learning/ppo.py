@@ -115,7 +115,7 @@ class PPO(Resumable):
         data = self._learning_data(rollout)
         report: dict[str, Tensor] = {}
         for _ in range(c.epochs):
-            shuffled = shuffle(data, generators)
+            shuffled = _shuffle(data, generators)
             for batch in torch.tensor_split(shuffled, c.minibatches, dim=1):
                 report = self._minibatch(batch)
         self.updates += 1
@@ -195,7 +195,7 @@ class PPO(Resumable):
             to_value = (2.0 * c.value_weight / error.shape[1]) * error
         self.optimiser.zero_grad()
         torch.autograd.backward([mean, value, self.log_std], [to_mean, to_value, to_log_std])
-        clip_gradients([p.grad for p in self.parameters.values()], len(self.seeds), c.max_norm)
+        _clip_gradients([p.grad for p in self.parameters.values()], len(self.seeds), c.max_norm)
         self.optimiser.step()
         with torch.no_grad():
             self.log_std.clamp_(min=c.log_std_floor)
@@ -303,7 +303,7 @@ def surrogate_gradient(
     return slope * (x * precision), (slope * (square - 1.0)).sum(1, keepdim=True), ratio
 
 
-def shuffle(data: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
+def _shuffle(data: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
     """Put the rows of data (S, N, columns) in random order, each seed by its own generator."""
     S, N, columns = data.shape
     order = np.stack([g.permutation(N) + N * s for s, g in enumerate(generators)])
@@ -311,7 +311,7 @@ def shuffle(data: Tensor, generators: Sequence[np.random.Generator]) -> Tensor:
     return data.reshape(S * N, columns).index_select(0, index).reshape(S, N, columns)
 
 
-def clip_gradients(gradients: Sequence[Tensor | None], seeds: int, max_norm: float) -> None:
+def _clip_gradients(gradients: Sequence[Tensor | None], seeds: int, max_norm: float) -> None:
     """Scale each seed's gradient, over all parameters, to a norm of at most `max_norm`."""
     rows = [gradient.view(seeds, -1) for gradient in gradients if gradient is not None]
     squares = torch.stack([torch.linalg.vector_norm(row, dim=1) for row in rows])

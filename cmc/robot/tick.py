@@ -66,7 +66,7 @@ def _pointer(context: Any, address: Any) -> Any:
 
 
 @compiled
-def view(address: int, shape: int | tuple[int, ...]) -> Any:
+def _view(address: int, shape: int | tuple[int, ...]) -> Any:
     """The numbers at an address as an array of a shape."""
     return numba.carray(_pointer(address), shape)  # type: ignore[call-arg]
 
@@ -134,13 +134,13 @@ def _observe(w: Any, law: Any, jac: Array) -> None:
     """Pose, Jacobian (6, nv) of the driven joints and velocity of the site; the true tip."""
     mj_jacSite(law.model, w.data, jac.ctypes.data, jac[3:].ctypes.data, law.site)
     jac[:, JOINTS:] = 0.0  # sliders and the peg's mount have no motor
-    qvel = view(w.qvel, law.nv)
-    w.nominal[:] = view(w.site_pos, 3)
+    qvel = _view(w.qvel, law.nv)
+    w.nominal[:] = _view(w.site_pos, 3)
     mju_mat2Quat(w.turn.ctypes.data, w.site_mat)
     _times(jac, qvel, w.signals[6:])
     w.tip[:], w.tip_velocity[:] = w.nominal, w.signals[6:]
     if law.compliant:
-        w.tip[:], axes = view(w.tip_pos, 3), view(w.hand_mat, (3, 3))
+        w.tip[:], axes = _view(w.tip_pos, 3), _view(w.hand_mat, (3, 3))
         for i in range(3):
             w.tip_velocity[i] += axes[i, 0] * qvel[JOINTS] + axes[i, 1] * qvel[JOINTS + 1]
 
@@ -162,7 +162,7 @@ def _aim(w: Any, law: Any) -> None:
 def _torque(w: Any, law: Any, jac: Array, reference: Array, tau: Array) -> None:
     """Joint torques (nv,) that give the tip the acceleration `reference` (6,)."""
     nv = law.nv
-    q, dq = view(w.qpos, JOINTS), view(w.qvel, nv)
+    q, dq = _view(w.qpos, JOINTS), _view(w.qvel, nv)
     qn, r, undo = np.zeros(nv), reference.copy(), np.empty(6)
     qn[:JOINTS] = law.posture_stiffness * (law.posture - q) - law.posture_damping * dq[:JOINTS]
     _times(jac, qn, undo)  # what the posture would do to the tip
@@ -194,16 +194,16 @@ def _torque(w: Any, law: Any, jac: Array, reference: Array, tau: Array) -> None:
             r -= undo
             _solve(inverse, r, law.pivot_floor)
         _add_transposed(jac, r, tau)  # Nakanishi 3.3
-    tau += view(w.bias, nv)
-    tau -= view(w.passive, nv)  # joint damping is compensated
+    tau += _view(w.bias, nv)
+    tau -= _view(w.passive, nv)  # joint damping is compensated
 
 
 @compiled
 def _command(w: Any, law: Any, jac: Array, u: Array, tau: Array) -> None:
     """Torques of the pose or of the joint controller for the state last observed."""
     if law.joint:
-        gap = w.target_joints - view(w.qpos, JOINTS)
-        tau[:JOINTS] = law.joint_stiffness * gap + u + view(w.bias, JOINTS)
+        gap = w.target_joints - _view(w.qpos, JOINTS)
+        tau[:JOINTS] = law.joint_stiffness * gap + u + _view(w.bias, JOINTS)
     else:
         _aim(w, law)
         reference = law.kp * w.signals[:6] - law.kd * w.signals[6:] + u[:6]  # 2nd_sys
@@ -223,7 +223,7 @@ def _look(w: Any, law: Any, jac: Array) -> None:
     down, n, numbers = np.empty(4), min(law.nv, ROOM), w.numbers
     mju_mulQuat(down.ctypes.data, w.turn.ctypes.data, _UP.ctypes.data)
     mju_quat2Vel(w.rotation.ctypes.data, down.ctypes.data, 1.0)
-    w.joints[:n], w.joint_velocity[:n] = view(w.qpos, n), view(w.qvel, n)
+    w.joints[:n], w.joint_velocity[:n] = _view(w.qpos, n), _view(w.qvel, n)
     w.joint_error[:] = w.target_joints - w.joints[:JOINTS]
     away = w.goal - w.tip
     numbers[0], numbers[1], numbers[2] = _length(away), _length(w.rotation), _length(w.force)
@@ -257,7 +257,7 @@ def tick(rows: Record, laws: Record, jacs: Array, actions: Array) -> bool:
             u[i] = law.u_limit[i] * min(max(actions[k, i], -1.0), 1.0)
         if law.joint:
             # The low-level action may only add to the pull towards the sub-goal (appendix G).
-            u[:] = np.abs(u) * np.sign(w.target_joints - view(w.qpos, JOINTS))
+            u[:] = np.abs(u) * np.sign(w.target_joints - _view(w.qpos, JOINTS))
         for step in range(law.substeps):
             if step and law.hold:
                 mj_step(law.model, w.data)
@@ -266,7 +266,7 @@ def tick(rows: Record, laws: Record, jacs: Array, actions: Array) -> bool:
                 mj_step1(law.model, w.data)
                 _observe(w, law, jac)
             _command(w, law, jac, u, tau)
-            view(w.ctrl, JOINTS)[:] = tau[:JOINTS]
+            _view(w.ctrl, JOINTS)[:] = tau[:JOINTS]
             mj_step2(law.model, w.data)
         mj_step1(law.model, w.data)
         _contact(w, law.substeps)
@@ -280,8 +280,8 @@ def tick(rows: Record, laws: Record, jacs: Array, actions: Array) -> bool:
 @compiled
 def _contact(w: Any, steps: int) -> None:
     """Force at the end of the tick; the largest and the deepest penetration of its steps."""
-    w.force[:] = -view(w.push, 3)  # the sensor: the peg's push
-    forces, distances = view(w.forces, (steps, 3)), view(w.distances, steps)
+    w.force[:] = -_view(w.push, 3)  # the sensor: the peg's push
+    forces, distances = _view(w.forces, (steps, 3)), _view(w.distances, steps)
     largest, nearest = 0.0, 0.0
     for i in range(steps):
         largest = max(largest, forces[i, 0] ** 2 + forces[i, 1] ** 2 + forces[i, 2] ** 2)

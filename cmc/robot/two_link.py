@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import Array, checked, increasing, number, refuse_uncallable, together
+from cmc.theory.arrays import Array, checked, increasing, need, number, together
 
 TorqueLaw = Callable[[float, Array, Array], Array]
 
@@ -125,7 +125,7 @@ def simulate(
 
     The torque `law(t, q, q')`, N m, is held between two times, each one Runge-Kutta step (RK4).
     """
-    refuse_uncallable("law", law)
+    need(callable(law), "law", "a function", law)
     times = increasing("times", times)
     path = [np.stack(together(q=_pair("q", q, True), dq=_pair("dq", dq, True)))]
     for t, h in zip(times, np.diff(times), strict=False):

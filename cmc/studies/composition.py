@@ -21,12 +21,12 @@ from cmc.policies.latent_signal import LatentSignal, Trial, improve
 from cmc.theory.composite import certify_latent, composite
 
 
-def pendulum_torque(e: Tensor, e_dot: Tensor, p: Tensor) -> Tensor:
+def _pendulum_torque(e: Tensor, e_dot: Tensor, p: Tensor) -> Tensor:
     """Gymnasium's pendulum, angle'' = 15 sin(angle) + 3 tau, and e = -angle."""
     return (p + 15.0 * torch.sin(e)) / 3.0
 
 
-def arm_torque(e: Tensor, e_dot: Tensor, p: Tensor) -> Tensor:
+def _arm_torque(e: Tensor, e_dot: Tensor, p: Tensor) -> Tensor:
     """H(q) p + C(q, q') q' of `TwoLinkArm()` without gravity, its elbow at 90 degrees at e = 0."""
     bend, rate = torch.pi / 2 - e[..., 1], -e_dot
     c, h = 0.12 * torch.cos(bend), -0.12 * torch.sin(bend)
@@ -38,8 +38,8 @@ def arm_torque(e: Tensor, e_dot: Tensor, p: Tensor) -> Tensor:
 
 GAINS = (4.0, 5.0)  # K_p, 1/s^2, and K_d, 1/s
 MECHANISMS = {  # starts within +- (e, e'), rad and rad/s, of each axis
-    "pendulum": (np.array([[0.3, 0.5]]), pendulum_torque),
-    "two-link arm": (np.full((2, 2), 0.5), arm_torque),
+    "pendulum": (np.array([[0.3, 0.5]]), _pendulum_torque),
+    "two-link arm": (np.full((2, 2), 0.5), _arm_torque),
 }
 SIGNALS: dict[str, tuple[Any, Any]] = {  # floor and cap: slopes of the signal, of the policy
     "hand-made": (None, ([2.0, 0.5], [8.0, 1.0])),
@@ -48,7 +48,7 @@ SIGNALS: dict[str, tuple[Any, Any]] = {  # floor and cap: slopes of the signal, 
 }
 
 
-def positive(kind: Any, n: int, bounds: Any, **more: Any) -> Any:
+def _positive(kind: Any, n: int, bounds: Any, **more: Any) -> Any:
     """A small network of this kind, with a floor and a cap under its slopes."""
     return kind(n, hidden=(8,), slope_min=bounds[0], slope_max=bounds[1], **more)
 
@@ -63,8 +63,8 @@ def table(updates: int = 80) -> pd.DataFrame:
         best = trial.optimum(8)
         for title, (slopes, inner) in SIGNALS.items():
             torch.manual_seed(0)
-            policy = positive(PositiveNetwork, n, inner, bias=False, dtype=torch.float64)
-            judged = positive(LatentSignal, n, slopes) if slopes else model
+            policy = _positive(PositiveNetwork, n, inner, bias=False, dtype=torch.float64)
+            judged = _positive(LatentSignal, n, slopes) if slopes else model
             K1, K2 = (torch.as_tensor(K) for K in (model.K1, model.K2))
             signal: Any = judged if slopes else lambda e, v, K1=K1, K2=K2: K1 * e + K2 * v
             cost = improve(signal, policy, GAINS, trial, updates=updates, rate=0.05)[-1]

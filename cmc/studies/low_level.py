@@ -100,7 +100,7 @@ def search(world: Rollouts) -> Array:
     return gains
 
 
-def learn(world: Rollouts, seeds: Sequence[int], updates: int) -> tuple[Array, Array]:
+def _learn(world: Rollouts, seeds: Sequence[int], updates: int) -> tuple[Array, Array]:
     """Costs of the network at its start and after learning, (seeds,) each."""
     actor = capped_actor(STUDY.config_of("ctd3"), seeds)
     low = LatentLow(actor, seeds, world.model, world.horizon, world.config)
@@ -124,7 +124,7 @@ def table(
         nominal = search(rollouts())
         for setting in settings:
             world = rollouts(**SETTINGS[setting])
-            found = dict(zip(("start", "learned"), learn(world, seeds, updates), strict=True))
+            found = dict(zip(("start", "learned"), _learn(world, seeds, updates), strict=True))
             gains = cost(world, Gains(np.stack([nominal, search(world)])), 2, JUDGED, 2)
             found |= {"nominal gain": gains[:1], "searched gain": gains[1:]}
             for method, costs in found.items():

@@ -43,20 +43,20 @@ PENALTY = 0.001  # times the squared Jacobian, our choice
 TESTS, SIZES = 100, (0.5, 0.3, 0.1)  # m: half-widths of the box around the goal
 
 
-def tanks(y: Any, u: Any, pump: Any = (1.0, 1.0), outlet: Any = (1.0, 1.5)) -> Any:
+def _tanks(y: Any, u: Any, pump: Any = (1.0, 1.0), outlet: Any = (1.0, 1.5)) -> Any:
     """Levels in m, inflows in m/min; the first tank drains into the second."""
     first, second = outlet[0] * y[0] ** 0.5, outlet[1] * y[1] ** 0.5
     return [pump[0] * u[0] - first, first - second + pump[1] * u[1]]
 
 
 PLANT = Plant.from_function(
-    lambda y, u: tanks(y, u), y=([0.5, 0.5], [2.0, 2.0]), u=(0.0, 3.0), name="two tanks"
+    lambda y, u: _tanks(y, u), y=([0.5, 0.5], [2.0, 2.0]), u=(0.0, 3.0), name="two tanks"
 )
 SPACE = {o.name: o.transforms for o in transforms_that_fit(PLANT)}["reversed order"]
 U0 = PLANT.hold(GOAL)
 
 
-class PenalisedPPO(PPO):
+class _PenalisedPPO(PPO):
     """PPO, and after every minibatch one step down the squared Jacobian da/ds of its policy."""
 
     def _minibatch(self, batch: Tensor) -> dict[str, Tensor]:
@@ -74,7 +74,7 @@ class PenalisedPPO(PPO):
         return report
 
 
-def lqr() -> nn.Linear:
+def _lqr() -> nn.Linear:
     """The linear-quadratic regulator of the tanks at the goal, a = -K (z, int z)."""
     zero = np.zeros((2, 2))
     Lambda = SPACE.T_y @ PLANT.f_y(GOAL, U0) @ np.linalg.inv(SPACE.T_y)
@@ -87,7 +87,7 @@ def lqr() -> nn.Linear:
     return policy
 
 
-def of_seed(policy: nn.Module, k: int) -> Any:
+def _of_seed(policy: nn.Module, k: int) -> Any:
     """One seed's a as a function of s (..., 2, 2), in double precision on numpy arrays."""
 
     def action(s: Array) -> Array:
@@ -100,7 +100,7 @@ def of_seed(policy: nn.Module, k: int) -> Any:
     return action
 
 
-def trial(action: Any, shifted: bool) -> tuple[float, float, float]:
+def _trial(action: Any, shifted: bool) -> tuple[float, float, float]:
     """Mean return, share of unstable tests, share that are at rest and off."""
     rng = np.random.default_rng(7)
     spread = np.exp(rng.uniform(np.log([0.5, 0.5, 0.7, 0.7]), np.log([3, 3, 1.4, 1.4]), (TESTS, 4)))
@@ -114,7 +114,7 @@ def trial(action: Any, shifted: bool) -> tuple[float, float, float]:
         u = np.clip(U0 + action(np.stack([z, integral], -1)) @ SPACE.T_a.T, 0.0, 3.0)
         for _ in range(8):
             outlet = np.array([1.0, 1.5])[:, None] * spread[2:]
-            y = np.maximum(y + dt * np.stack(tanks(y.T, u.T, spread[:2], outlet), -1), 1e-3)
+            y = np.maximum(y + dt * np.stack(_tanks(y.T, u.T, spread[:2], outlet), -1), 1e-3)
         total -= np.mean(((y - GOAL) / 0.75) ** 2, -1) * (len(errors) < STEPS)
         errors.append(y - GOAL)
     late = np.array(errors[-STEPS // 2 :])
@@ -123,7 +123,7 @@ def trial(action: Any, shifted: bool) -> tuple[float, float, float]:
     return float(total.mean()), float(moves.mean()), float(off.mean())
 
 
-def certified(action: Any) -> float:
+def _certified(action: Any) -> float:
     """Half-width of the largest box that was tried around the goal and is certified, m; or 0."""
     for size in SIZES:
         box = Region(GOAL - 0.999 * size, GOAL + 0.999 * size, points=5)
@@ -137,10 +137,10 @@ free = lambda: DirectPolicy(JointNetwork(2, inputs=4, seeds=SEEDS))  # noqa: E73
 convex = lambda: ModularPolicy(ConvexGradientNetwork(2, seeds=SEEDS))  # noqa: E731
 METHODS: dict[str, tuple[str, type[PPO] | None, Callable[[], nn.Module]]] = {
     "ppo": ("PPO", PPO, free),
-    "penalty": ("PPO with a Jacobian penalty", PenalisedPPO, free),
+    "penalty": ("PPO with a Jacobian penalty", _PenalisedPPO, free),
     "cppo": ("C-PPO", PPO, lambda: ModularPolicy(PositiveNetwork(2, seeds=SEEDS, **BOUNDS))),
     "convex": ("convex-gradient PI", PPO, convex),
-    "lqr": ("LQR", None, lqr),
+    "lqr": ("LQR", None, _lqr),
 }
 """Title, learner, and the policy of all seeds side by side."""
 
@@ -160,9 +160,9 @@ def table(updates: int = UPDATES) -> pd.DataFrame:
         spent = (time.process_time() - begin) / len(seeds)
         about = {"method": name, "title": title, "test": "nominal", "last": True, "step": steps}
         for k in seeds:
-            action = of_seed(policy, k)
+            action = _of_seed(policy, k)
             row: dict[str, Any] = about | {"seed": k}
-            row["return"], row["unstable"], row["off"] = trial(action, shifted=False)
-            _, row["unstable_shifted"], row["off_shifted"] = trial(action, shifted=True)
-            rows.append(row | {"certified_m": certified(action), "cpu_s": spent})
+            row["return"], row["unstable"], row["off"] = _trial(action, shifted=False)
+            _, row["unstable_shifted"], row["off_shifted"] = _trial(action, shifted=True)
+            rows.append(row | {"certified_m": _certified(action), "cpu_s": spent})
     return pd.DataFrame(rows).round(4)

@@ -70,7 +70,7 @@ class TouchConfig:
         return largest_slope(tau, np.array([1.0, self.worst_stiffness * stiffest]), task.h)
 
 
-class TouchTraining(PPO):
+class _TouchTraining(PPO):
     """PPO on peg touch with the face of a study's training, whose steps are episodes."""
 
     steps = PPO.episodes
@@ -101,13 +101,13 @@ class TouchTraining(PPO):
 Network = Callable[[TouchConfig, Sequence[int]], nn.Module]
 
 
-def modular(network: Callable[..., nn.Module], integral: bool = True, **options: Any) -> Network:
+def _modular(network: Callable[..., nn.Module], integral: bool = True, **options: Any) -> Network:
     """A network that sees each error and its integral."""
     options = {"hidden": HIDDEN, **options}
     return lambda _, seeds: ModularPolicy(network(2, seeds=seeds, **options), integral=integral)
 
 
-def positive(
+def _positive(
     capped: bool = False, floor: Any = None, ceiling: Any = None, **options: Any
 ) -> Network:
     """Positive weights, with bounds on the slopes by construction.
@@ -125,24 +125,24 @@ def positive(
             more["slope_min"] = room * floor
         if ceiling is not None:
             more["slope_max"] = SAFETY * (room * ceiling)
-        return modular(PositiveNetwork, **more)(config, seeds)
+        return _modular(PositiveNetwork, **more)(config, seeds)
 
     return build
 
 
-def raw(config: TouchConfig, seeds: Sequence[int]) -> nn.Module:
+def _raw(config: TouchConfig, seeds: Sequence[int]) -> nn.Module:
     """One network that sees x, f and the targets: no error, no integral, no sign rule."""
     return DirectPolicy(JointNetwork(2, inputs=4, hidden=HIDDEN, seeds=seeds), part=slice(0, 4))
 
 
-def fixed(*gains: tuple[float, float]) -> Network:
+def _fixed(*gains: tuple[float, float]) -> Network:
     """Hand-tuned gains (k1, k2) of each dimension."""
     return lambda config, seeds: ModularPolicy(LinearNetwork(np.array(gains)))
 
 
-def arm(title: str, network: Network, *steps: Change, trained: bool = True) -> Method:
+def _arm(title: str, network: Network, *steps: Change, trained: bool = True) -> Method:
     """A method that trains a network by PPO, and what it changes of the configuration."""
-    build = lambda config, seeds: TouchTraining(config, network(config, seeds), seeds)  # noqa: E731
+    build = lambda config, seeds: _TouchTraining(config, network(config, seeds), seeds)  # noqa: E731
     return Method(title, build, both(*steps), trained)
 
 
@@ -154,53 +154,55 @@ STRESS = changed(ppo={"learning_rate": 3e-3, "epochs": 10, "log_std_floor": -20.
 # Little noise vertically, and as much as horizontally.
 QUIET, LOUD = changed(noise=(-1.0, -3.0)), changed(noise=(-1.0, -1.0))
 BYPASS = [[0.0, 0.0], [0.15, 0.6]]  # shares of the limit, vertically; our choice
-FREE, CPPO, CAPPED = modular(IndependentNetwork), positive(), positive(capped=True)
-PI, PI_SCALED = fixed((2.0, 40.0), (0.02, 8.0)), fixed((2.0, 40.0), (0.012, 5.6))
+FREE, CPPO, CAPPED = _modular(IndependentNetwork), _positive(), _positive(capped=True)
+PI, PI_SCALED = _fixed((2.0, 40.0), (0.02, 8.0)), _fixed((2.0, 40.0), (0.012, 5.6))
 
 METHODS: dict[str, Method] = {
-    "cppo": arm("C-PPO", CPPO),
-    "ppo": arm("PPO, one network per dimension", FREE),
-    "cppo_capped": arm("C-PPO, capped", CAPPED),
-    "cppo_bypass": arm("C-PPO, capped, vertical bypass", positive(capped=True, floor=BYPASS)),
-    "cppo_scaled": arm("C-PPO, capped loop gain", CAPPED, SCALED),
-    "ppo_stress": arm("PPO, stress setting", FREE, STRESS),
-    "cppo_stress": arm("C-PPO, stress setting", CPPO, STRESS),
-    "ppo_joint": arm("PPO, joint network", modular(JointNetwork)),
-    "ppo_raw": arm("PPO, raw inputs", raw, RAW),
-    "cppo_identity": arm("C-PPO, T_y = T_a = I", CPPO, IDENTITY),
-    "cppo_bounded": arm("C-PPO, bounded on both sides", positive(capped=True, floor=0.5 * 0.05)),
-    "cppo_no_integral": arm("C-PPO, no integral", modular(PositiveNetwork, integral=False)),
-    "convex_pi": arm("Convex-gradient PI", modular(ConvexGradientNetwork, hidden=HIDDEN[0])),
-    "pi": arm("Hand-tuned PI", PI, trained=False),
-    "pi_scaled": arm("Hand-tuned PI, scheduled on stiffness", PI_SCALED, SCALED, trained=False),
+    "cppo": _arm("C-PPO", CPPO),
+    "ppo": _arm("PPO, one network per dimension", FREE),
+    "cppo_capped": _arm("C-PPO, capped", CAPPED),
+    "cppo_bypass": _arm("C-PPO, capped, vertical bypass", _positive(capped=True, floor=BYPASS)),
+    "cppo_scaled": _arm("C-PPO, capped loop gain", CAPPED, SCALED),
+    "ppo_stress": _arm("PPO, stress setting", FREE, STRESS),
+    "cppo_stress": _arm("C-PPO, stress setting", CPPO, STRESS),
+    "ppo_joint": _arm("PPO, joint network", _modular(JointNetwork)),
+    "ppo_raw": _arm("PPO, raw inputs", _raw, RAW),
+    "cppo_identity": _arm("C-PPO, T_y = T_a = I", CPPO, IDENTITY),
+    "cppo_bounded": _arm("C-PPO, bounded on both sides", _positive(capped=True, floor=0.5 * 0.05)),
+    "cppo_no_integral": _arm("C-PPO, no integral", _modular(PositiveNetwork, integral=False)),
+    "convex_pi": _arm("Convex-gradient PI", _modular(ConvexGradientNetwork, hidden=HIDDEN[0])),
+    "pi": _arm("Hand-tuned PI", PI, trained=False),
+    "pi_scaled": _arm("Hand-tuned PI, scheduled on stiffness", PI_SCALED, SCALED, trained=False),
 }
 
 
-def bypass(k1: float, k2: float) -> Network:
+def _bypass(k1: float, k2: float) -> Network:
     """A cap, with these shares of the vertical room in a linear bypass."""
-    return positive(capped=True, floor=[[0.0, 0.0], [k1, k2]])
+    return _positive(capped=True, floor=[[0.0, 0.0], [k1, k2]])
 
 
-ODD = positive(capped=True, bias=False)
+ODD = _positive(capped=True, bias=False)
 _SCALED_BYPASS = "joint cap on the loop gain, most of it in a bypass, little noise"
 CAPS: dict[str, Method] = {
-    "none": arm("no cap", CPPO, LOUD),
-    "separate": arm("half the room to each slope", positive(ceiling=[0.5, 0.5]), LOUD),
-    "separate_p": arm("nine tenths to k1", positive(ceiling=[0.9, 1.0 - 0.9]), LOUD),
-    "separate_i": arm("nine tenths to k2", positive(ceiling=[0.1, 0.9]), LOUD),
-    "joint": arm("joint cap on k1 + (h/2) k2", CAPPED, LOUD),
-    "joint_odd": arm("joint cap, no biases: the product bound is reached", ODD, LOUD),
-    "joint_shallow": arm("joint cap, one hidden layer", positive(capped=True, hidden=(32,)), LOUD),
-    "joint_bypass_i": arm("joint cap, a quarter in a bypass of k2", bypass(0.0, 0.25), LOUD),
-    "joint_bypass_p": arm("joint cap, a quarter in a bypass of k1", bypass(0.25, 0.0), LOUD),
-    "joint_bypass": arm("joint cap, most of it in a bypass", bypass(0.15, 0.6), LOUD),
-    "scaled": arm("joint cap on the loop gain", CAPPED, LOUD, SCALED),
-    "scaled_quiet": arm("joint cap on the loop gain, little noise", CAPPED, QUIET, SCALED),
-    "scaled_bypass": arm(_SCALED_BYPASS, bypass(0.2, 0.5), QUIET, SCALED),
-    "scaled_odd": arm("joint cap on the loop gain, little noise, no biases", ODD, QUIET, SCALED),
-    "joint_quiet": arm("joint cap, little noise", CAPPED, QUIET),
-    "none_bypass": arm("no cap, the same bypass", positive(floor=BYPASS), LOUD),
-    "none_quiet": arm("no cap, little noise", CPPO, QUIET),
+    "none": _arm("no cap", CPPO, LOUD),
+    "separate": _arm("half the room to each slope", _positive(ceiling=[0.5, 0.5]), LOUD),
+    "separate_p": _arm("nine tenths to k1", _positive(ceiling=[0.9, 1.0 - 0.9]), LOUD),
+    "separate_i": _arm("nine tenths to k2", _positive(ceiling=[0.1, 0.9]), LOUD),
+    "joint": _arm("joint cap on k1 + (h/2) k2", CAPPED, LOUD),
+    "joint_odd": _arm("joint cap, no biases: the product bound is reached", ODD, LOUD),
+    "joint_shallow": _arm(
+        "joint cap, one hidden layer", _positive(capped=True, hidden=(32,)), LOUD
+    ),
+    "joint_bypass_i": _arm("joint cap, a quarter in a bypass of k2", _bypass(0.0, 0.25), LOUD),
+    "joint_bypass_p": _arm("joint cap, a quarter in a bypass of k1", _bypass(0.25, 0.0), LOUD),
+    "joint_bypass": _arm("joint cap, most of it in a bypass", _bypass(0.15, 0.6), LOUD),
+    "scaled": _arm("joint cap on the loop gain", CAPPED, LOUD, SCALED),
+    "scaled_quiet": _arm("joint cap on the loop gain, little noise", CAPPED, QUIET, SCALED),
+    "scaled_bypass": _arm(_SCALED_BYPASS, _bypass(0.2, 0.5), QUIET, SCALED),
+    "scaled_odd": _arm("joint cap on the loop gain, little noise, no biases", ODD, QUIET, SCALED),
+    "joint_quiet": _arm("joint cap, little noise", CAPPED, QUIET),
+    "none_bypass": _arm("no cap, the same bypass", _positive(floor=BYPASS), LOUD),
+    "none_quiet": _arm("no cap, little noise", CPPO, QUIET),
 }
 
 
@@ -209,12 +211,12 @@ def change(shift: str, h: float | None = None) -> Change:
     return changed(task={"shift": SHIFTS[shift]} | ({} if h is None else {"h": h}))
 
 
-def paper(marks: Sequence[int]) -> Sequence[int]:
+def _paper(marks: Sequence[int]) -> Sequence[int]:
     """The episode of the paper's generalization test (fig:1 c); in a shorter run the last one."""
     return [5000] if 5000 in marks else marks[-1:]
 
 
-def sparse(marks: Sequence[int]) -> Sequence[int]:
+def _sparse(marks: Sequence[int]) -> Sequence[int]:
     """Kept policies at which every method is tested."""
     return [m for m in marks if m in (1000, 5000, 10_000, 15_000) or m == marks[-1]]
 
@@ -227,21 +229,21 @@ _SIDE = tuple(name for name in METHODS if name not in _CAPPED + _MAIN)
 _MANY, _FEW = 8000, 2000
 TESTS = (
     Test("nominal", _MANY, methods=("cppo", "ppo", *_CAPPED)),
-    Test("nominal", _MANY, when=sparse, methods=_MAIN[2:]),
+    Test("nominal", _MANY, when=_sparse, methods=_MAIN[2:]),
     Test("nominal", _FEW, methods=_CURVES),
-    Test("nominal", _FEW, when=sparse, methods=tuple(m for m in _SIDE if m not in _CURVES)),
+    Test("nominal", _FEW, when=_sparse, methods=tuple(m for m in _SIDE if m not in _CURVES)),
     *(
         Test(shift, number, change(shift), when, methods)
         for shift in SHIFTS
         if shift != "nominal"
         for number, when, methods in (
             (_MANY, same, _CAPPED),
-            (_MANY, lambda marks: sorted({*paper(marks), *last(marks)}), _MAIN),
-            (_FEW, paper, _SIDE),
+            (_MANY, lambda marks: sorted({*_paper(marks), *last(marks)}), _MAIN),
+            (_FEW, _paper, _SIDE),
         )
     ),
     *(  # of the sampled-data bound; training has 0.01 s
-        Test("nominal", _FEW, change("nominal", h), paper, _TIMED)
+        Test("nominal", _FEW, change("nominal", h), _paper, _TIMED)
         for h in (0.002, 0.005, 0.02, 0.03)
     ),
 )
@@ -257,13 +259,13 @@ STUDY = Study(
     every=1000,
     judge=judge,
     motion=motion,
-    shown=paper,
+    shown=_paper,
     unit="episode",
     gain="return",
 )
 
 
-def at_period(h: float) -> Study:
+def _at_period(h: float) -> Study:
     """The study with another control period [s]: episodes and discounts keep their duration."""
     old, share = STUDY.config, h / STUDY.config.task.h
     ppo = {key: getattr(old.ppo, key) ** share for key in ("gamma", "gae_lambda")}
@@ -272,7 +274,7 @@ def at_period(h: float) -> Study:
     config = {"task": task, "ppo": ppo | {"steps": task["horizon"]}}
     made = STUDY.variant(f"peg_touch_{1e3 * h:g}ms", about, **config)
     tests = tuple(
-        Test(shift, _FEW, change(shift), same if shift == "nominal" else paper) for shift in SHIFTS
+        Test(shift, _FEW, change(shift), same if shift == "nominal" else _paper) for shift in SHIFTS
     )
     methods = {name: METHODS[name] for name in ("cppo", "ppo", "ppo_raw")}
     return replace(made, methods=methods, tests=tests)
@@ -287,4 +289,4 @@ _CAPS = replace(
     length=5000,
     every=5000,
 )
-VARIANTS = {study.name: study for study in (_CAPS, at_period(0.002), at_period(0.005))}
+VARIANTS = {study.name: study for study in (_CAPS, _at_period(0.002), _at_period(0.005))}

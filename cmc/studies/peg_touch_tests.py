@@ -48,8 +48,8 @@ CROSSINGS, PERSISTENCE = 4, 0.7
 def judge(config: Any, policy: nn.Module, seeds: int, test: Test) -> dict[str, Rows]:
     """One test of one policy, and what its weights guarantee."""
     found = measure(policy, config.task, test.number, seeds)
-    if test.change is same and signed(policy):
-        found["certificates"] = certificates(policy, config.task, config.slope_limit())
+    if test.change is same and _signed(policy):
+        found["certificates"] = _certificates(policy, config.task, config.slope_limit())
     return found
 
 
@@ -68,12 +68,12 @@ def measure(policy: nn.Module, task: PegTouchConfig, number: int, seeds: int) ->
     more: dict[str, Any] = {"trajectories": number, "h": task.h}
     if run.wrong_sign is not None:
         found["wrong_sign_signal"], found["wrong_sign_integral"] = run.wrong_sign.T
-        from_weights = signed(policy) and bool(policy.integral)
+        from_weights = _signed(policy) and bool(policy.integral)
         s, reachable = torch.as_tensor(run.mean_s, dtype=torch.float32), np.ones((seeds, number))
         if from_weights:
             s, exists = equilibrium(policy, run.envs, seeds)
             reachable = np.all(exists, axis=-1)
-        predicted = predicted_oscillation(policy, s, run.envs)
+        predicted = _predicted_oscillation(policy, s, run.envs)
         more["prediction"] = "weights" if from_weights else "visited"
         found["predicted_oscillation"] = predicted.mean(axis=1)
         found["agreement"] = (predicted == flags["oscillation"]).mean(axis=1)
@@ -194,7 +194,7 @@ def equilibrium(policy: nn.Module, envs: PegTouchVectorEnv, seeds: int) -> tuple
     return torch.stack([torch.zeros_like(middle), middle], dim=-1), exists.numpy()
 
 
-def predicted_oscillation(policy: nn.Module, s: Tensor, envs: PegTouchVectorEnv) -> Flags:
+def _predicted_oscillation(policy: nn.Module, s: Tensor, envs: PegTouchVectorEnv) -> Flags:
     """Whether the sampled loop of some dimension is unstable at the inputs `s`, (seeds, num).
 
     The local slopes k1, k2 go into k1 + (h/2) k2 < coth(h / (2 tau)) / K with the true tau and K.
@@ -212,13 +212,13 @@ def predicted_oscillation(policy: nn.Module, s: Tensor, envs: PegTouchVectorEnv)
     return np.any(sampled_margin(k1, k2, tau, K, c.h) < 0, axis=-1)
 
 
-def signed(policy: nn.Module) -> bool:
+def _signed(policy: nn.Module) -> bool:
     """Whether the weights guarantee the sign of every slope, each dimension on its own."""
     network = getattr(policy, "network", None)
     return hasattr(network, "slope_bounds") and not isinstance(network, ConvexGradientNetwork)
 
 
-def certificates(policy: nn.Module, task: PegTouchConfig, limit: Array) -> Rows:
+def _certificates(policy: nn.Module, task: PegTouchConfig, limit: Array) -> Rows:
     """What holds for each seed of a policy, from its weights alone.
 
     In contact and in the coordinates (x, z) the peg is two separate lags with gains 1 and K,

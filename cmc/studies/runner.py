@@ -20,7 +20,7 @@ import torch
 from cmc import store
 from cmc.learning.state import interruptions, plain, single_thread
 from cmc.studies.study import Study, checked_seeds, checked_study
-from cmc.theory.arrays import count, refuse_uncallable
+from cmc.theory.arrays import count, need
 
 Callback = Callable[[dict[str, Any]], object]
 Progress = Callable[[int, int, str], object]
@@ -51,7 +51,7 @@ def train(
     """
     method = checked_study(study).method(name)
     total = count(f"length ({study.unit}s)", study.length if length is None else length, MOST)
-    refuse_uncallable("callback", callback or print)
+    need(callable(callback or print), "callback", "a function", callback or print)
     if not method.trained:
         raise ValueError(f"{name!r} has fixed gains: there is nothing to train")
     seeds = checked_seeds(seeds)

@@ -40,7 +40,7 @@ def low_level(config: PandaTaskConfig, y: Array, integral: Array) -> Array:
     return np.tanh(SLOPE * (y + integral) / np.array(config.u_limit))
 
 
-def drive(task: PandaTask, aims: Iterable[Array | None]) -> Iterator[dict[str, Any]]:
+def _drive(task: PandaTask, aims: Iterable[Array | None]) -> Iterator[dict[str, Any]]:
     """What each tick tells, under the fixed low level and these sub-goals (None: keep)."""
     obs = task.reset()
     for aim in aims:
@@ -53,7 +53,7 @@ def drive(task: PandaTask, aims: Iterable[Array | None]) -> Iterator[dict[str, A
 
 def measure(config: PandaTaskConfig, worlds: int = 32, ticks: int = 1200) -> dict[str, float]:
     """One row: tracking, pressing and impact on two walls, and a random high level."""
-    found = tracking(config) | wander(config, worlds, ticks)
+    found = tracking(config) | _wander(config, worlds, ticks)
     return found | {k: v for axis in WALLS for k, v in press(config, axis).items()}
 
 
@@ -63,7 +63,7 @@ def tracking(config: PandaTaskConfig) -> dict[str, float]:
     ends |= {name.replace("low", "high"): (1.0,) * 3 for name in ends}
     task = PegMaze(replace(config, scene="panda.xml", start_joints=0.0, **ends), 6, seed=0)  # type: ignore[arg-type]
     target = np.array(config.start) + 0.005 * np.vstack([np.eye(3), -np.eye(3)])
-    list(drive(task, chain([target], repeat(None, config.horizon - 1))))
+    list(_drive(task, chain([target], repeat(None, config.horizon - 1))))
     left = np.linalg.norm(target - task.worlds.tip, axis=-1) / 0.005
     return {"left_worst": float(left.max()), "left_mean": float(left.mean())}
 
@@ -73,7 +73,7 @@ def press(config: PandaTaskConfig, axis: str) -> dict[str, float]:
     start, beyond = WALLS[axis]
     task, i = PegMaze(replace(config, start=start, start_joints=0.0), 1, seed=0), "xyz".index(axis)
     speeds, now, peaks = [], [], []
-    for info in drive(task, chain([np.array([beyond])], repeat(None, 199))):
+    for info in _drive(task, chain([np.array([beyond])], repeat(None, 199))):
         speeds.append(abs(float(task.worlds.signals[0, 6 + i])))
         now.append(float(info["contact_force"][0]))
         peaks.append(float(info["contact_force_max"][0]))
@@ -92,13 +92,13 @@ def press(config: PandaTaskConfig, axis: str) -> dict[str, float]:
     }
 
 
-def wander(config: PandaTaskConfig, worlds: int, ticks: int) -> dict[str, float]:
+def _wander(config: PandaTaskConfig, worlds: int, ticks: int) -> dict[str, float]:
     """A random high level, with forces counted at 50 Hz and as maximum over the physics steps."""
     task, rng = PegMaze(config, worlds, seed=0), np.random.default_rng(0)
     ends, shape = (config.subgoal_low, config.subgoal_high), (worlds, config.high_size)
     aims = (rng.uniform(*ends, shape) if k % config.horizon == 0 else None for k in range(ticks))
     now, peaks = [], []
-    for info in drive(task, aims):
+    for info in _drive(task, aims):
         now.append(info["contact_force"])
         peaks.append(info["contact_force_max"])
         if len(peaks) % config.ticks == 0:

@@ -109,12 +109,12 @@ Policy = tuple[nn.Module, LowLevel]
 """What is tested: the planner and a low level that neither explores nor learns."""
 
 
-def none(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
+def _none(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
     """No action."""
     return LowLevel(None, N)
 
 
-def gain(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
+def _gain(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
     """A slope set by hand, for y and its integral alike."""
     start = _start(config)
     return LowLevel(latent_policy(LinearNetwork(np.stack([start, start], -1))), N)
@@ -143,7 +143,7 @@ def capped_actor(config: TwoLevelConfig, seeds: Seeds) -> ModularPolicy:
     return latent_policy(net)
 
 
-def critic(network: Callable[..., Any], corrected: bool = False) -> Builder:
+def _critic(network: Callable[..., Any], corrected: bool = False) -> Builder:
     """A network with biases that learns from a critic.
 
     The paper's critic, as we read it, sees (y, integral of y) and learns one-step targets from
@@ -168,7 +168,7 @@ def critic(network: Callable[..., Any], corrected: bool = False) -> Builder:
     return build
 
 
-def joints(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
+def _joints(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
     """HIRO's low level: one network that moves all joints."""
     task, start = config.task, start_joints(config.task)
     half, n = np.array(task.subgoal_high), task.low_size
@@ -198,7 +198,7 @@ def two_level(low_level: Builder, relabel: bool = False) -> Callable[..., TwoLev
     return build
 
 
-def one_level(config: TwoLevelConfig, seeds: Seeds) -> OneLevelPPO:
+def _one_level(config: TwoLevelConfig, seeds: Seeds) -> OneLevelPPO:
     """A planner that learns by PPO, without a low level."""
     task, planning, actor, _ = _planner(config, seeds)
     env = SegmentEnv(task, planning, config.hierarchy.reward_scale)
@@ -217,12 +217,12 @@ def _planner(config: TwoLevelConfig, seeds: Seeds) -> tuple[PandaTask, Planning,
 # -- methods --------------------------------------------------------------------------------------
 
 
-def arm(title: str, low_level: Builder, *steps: Change, relabel: bool = False) -> Method:
+def _arm(title: str, low_level: Builder, *steps: Change, relabel: bool = False) -> Method:
     """A method whose planner learns by TD3, and what it changes of the configuration."""
     return Method(title, two_level(low_level, relabel), both(*steps))
 
 
-def in_joints(config: TwoLevelConfig) -> TwoLevelConfig:
+def _in_joints(config: TwoLevelConfig) -> TwoLevelConfig:
     """HIRO has a task of its own, and a planner that sees the joints."""
     task = config.joint_task
     if task is None:
@@ -249,37 +249,41 @@ AVERAGED = changed(planner={"average": 5e-4})
 GAUSSIAN = changed(hierarchy={"redraw": (0.0, 0.0), "burst": (0.0, 0.0)})
 
 
-def model(config: TwoLevelConfig) -> TwoLevelConfig:
+def _model(config: TwoLevelConfig) -> TwoLevelConfig:
     """Learning through the latent model has updates and a cap of its own."""
     updates = changed(hierarchy={"low_updates": 16, "low_updates_late": 1, "low_late": 20_000})
     return replace(updates(config), cap=config.latent.cap)
 
 
-def noise(high: float, low: float) -> Change:
+def _noise(high: float, low: float) -> Change:
     """HIRO's noise of the planner and of the low level, in half-ranges."""
     return changed(hierarchy={"high_noise": high, "high_noise_end": None}, joint_noise=low)
 
 
 METHODS: dict[str, Method] = {
-    "ctd3": arm("TD3/C-TD3", latent, model),
-    "ctd3_tuned": arm("TD3/C-TD3, tuned start", latent, model, TUNED),
-    "ctd3_short": arm("TD3/C-TD3, discount .5", latent, model, changed(planner={"discount": 0.5})),
-    "ctd3_plain_view": arm("TD3/C-TD3, plain view", latent, model, changed(relative=False)),
-    "ctd3_no_bursts": arm("TD3/C-TD3, Gaussian noise alone", latent, model, GAUSSIAN),
-    "ctd3_no_pull": arm("TD3/C-TD3, no pull", latent, model, changed(planner={"pull": 0.0})),
-    "ctd3_averaged": arm("TD3/C-TD3, averaged planner", latent, model, AVERAGED),
-    "ctd3_paper": arm("TD3/C-TD3, the paper's scheme", critic(PositiveNetwork)),
-    "ctd3_positive": arm("TD3/C-TD3, corrected critic", critic(PositiveNetwork, corrected=True)),
-    "frozen": arm("TD3/frozen random C", frozen, RESTING),
-    "frozen_tuned": arm("TD3/frozen random C, tuned start", frozen, RESTING, TUNED),
-    "gain": arm("TD3/hand-tuned gain", gain, RESTING, TUNED),
-    "td3": arm("TD3/TD3, plain critic", critic(IndependentNetwork)),
-    "td3_corrected": arm("TD3/TD3, corrected critic", critic(IndependentNetwork, corrected=True)),
-    "control": arm("TD3/Control", none, RESTING),
-    "ppo_control": Method("PPO/Control", one_level),
+    "ctd3": _arm("TD3/C-TD3", latent, _model),
+    "ctd3_tuned": _arm("TD3/C-TD3, tuned start", latent, _model, TUNED),
+    "ctd3_short": _arm(
+        "TD3/C-TD3, discount .5", latent, _model, changed(planner={"discount": 0.5})
+    ),
+    "ctd3_plain_view": _arm("TD3/C-TD3, plain view", latent, _model, changed(relative=False)),
+    "ctd3_no_bursts": _arm("TD3/C-TD3, Gaussian noise alone", latent, _model, GAUSSIAN),
+    "ctd3_no_pull": _arm("TD3/C-TD3, no pull", latent, _model, changed(planner={"pull": 0.0})),
+    "ctd3_averaged": _arm("TD3/C-TD3, averaged planner", latent, _model, AVERAGED),
+    "ctd3_paper": _arm("TD3/C-TD3, the paper's scheme", _critic(PositiveNetwork)),
+    "ctd3_positive": _arm("TD3/C-TD3, corrected critic", _critic(PositiveNetwork, corrected=True)),
+    "frozen": _arm("TD3/frozen random C", frozen, RESTING),
+    "frozen_tuned": _arm("TD3/frozen random C, tuned start", frozen, RESTING, TUNED),
+    "gain": _arm("TD3/hand-tuned gain", _gain, RESTING, TUNED),
+    "td3": _arm("TD3/TD3, plain critic", _critic(IndependentNetwork)),
+    "td3_corrected": _arm("TD3/TD3, corrected critic", _critic(IndependentNetwork, corrected=True)),
+    "control": _arm("TD3/Control", _none, RESTING),
+    "ppo_control": Method("PPO/Control", _one_level),
 }
 HIRO: dict[str, Method] = {
-    "hiro": arm("HIRO", joints, in_joints, noise(1.0, 1.0), relabel=True),
-    "hiro_matched": arm("HIRO, matched noise", joints, in_joints, noise(0.3, 0.1), relabel=True),
+    "hiro": _arm("HIRO", _joints, _in_joints, _noise(1.0, 1.0), relabel=True),
+    "hiro_matched": _arm(
+        "HIRO, matched noise", _joints, _in_joints, _noise(0.3, 0.1), relabel=True
+    ),
 }
 """Where the study has a task in joint space."""

@@ -98,11 +98,6 @@ def count(name: str, value: float, most: int = 1_000_000) -> int:
     return int(value)
 
 
-def refuse_uncallable(name: str, value: Any) -> None:
-    """Raise a TypeError where `value` cannot be called."""
-    need(callable(value), name, "a function", value)
-
-
 def need(fits: bool, name: str, wish: str, value: Any) -> None:
     """Raise a TypeError where `value` is not of the kind that was wished for."""
     if not fits:

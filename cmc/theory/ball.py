@@ -24,7 +24,7 @@ from cmc.theory.slopes import BlockLoop
 _SAMPLES = 2048
 
 
-def rest_point(loop: Loop, keep: Array) -> Array | None:
+def _rest_point(loop: Loop, keep: Array) -> Array | None:
     """State (y, int z), (2n,), in which the loop rests; None where Newton's method finds none.
 
     `keep` says which states the loop has: an integral that nothing uses is free.
@@ -62,7 +62,7 @@ def ball_everywhere(
     space, keep, h = blocks.space, blocks.keep, blocks.h
     try:
         loop = Loop(plant, policy, space, y_ref)
-        rest = rest_point(loop, keep)
+        rest = _rest_point(loop, keep)
     except (ValueError, TypeError):  # slopes alone say nothing about commands
         rest = None
     if rest is None:
@@ -82,7 +82,7 @@ def ball_in_box(
     answer: Certificate, loop: Loop, keep: Array, low: Array, high: Array, h: float | None
 ) -> Certificate:
     """Add the ball to a certificate in (y, int z) over a box; commands are looked at on points."""
-    caution, rest = "nothing says that they do", rest_point(loop, keep)
+    caution, rest = "nothing says that they do", _rest_point(loop, keep)
     if rest is None:
         return replace(answer, reason=f"{answer.reason} ({caution}: no point of rest was found)")
     n, m, spread, limits = loop.n, len(keep), _spread_of(answer), command_limits(loop.plant)

@@ -123,7 +123,7 @@ def _where(bad: NDArray[np.bool_]) -> str:
 
 
 @compiled
-def basis_of(A, w, V):
+def _basis_of(A, w, V):
     """Write eigenvalues (descending) and eigenvectors of one real (n, n) matrix to w and V.
 
     Returns False where it has no real basis; numba before numpy 2.5 raises ValueError for n > 2.
@@ -207,7 +207,7 @@ def spaces_of(f_y, f_u, arrays):
         for i in range(n):
             for j in range(n):
                 total += 0.0 * (f_y[k, i, j] + f_u[k, i, j])
-        if total != 0.0 or not basis_of(f_y[k], w, V):
+        if total != 0.0 or not _basis_of(f_y[k], w, V):
             return False  # NaN is not 0 either
         if n == 2:
             det = V[0, 0] * V[1, 1] - V[0, 1] * V[1, 0]
