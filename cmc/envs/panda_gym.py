@@ -136,8 +136,7 @@ class PandaEnv(SingleEnv):
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """The world from the scene's own point of view, (480, 640, 3); None without render mode.
 
-        Raises:
-            RuntimeError: where MuJoCo finds no graphics.
+        A RuntimeError where MuJoCo finds no graphics.
         """
         if self.render_mode is None:
             gym.logger.warn("render was called without render_mode='rgb_array'")

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import nn
 
 from cmc.envs.panda_task import PandaTask
@@ -21,8 +20,7 @@ from cmc.learning.low_level import LowLevel, evaluate, rollout
 from cmc.learning.planning import Planning
 from cmc.learning.state import Arrays, Resumable, State, under
 from cmc.learning.td3 import TD3, Replay
-
-Array = NDArray[np.float64]
+from cmc.theory.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -132,9 +132,7 @@ def inverse_kinematics(
     The pose is a position (3,), m, and an orientation (w, x, y, z); the tool reaches `tool` metres
     from the flange down the hand's z axis. `q0` also decides the posture; the `tolerance` is on the
     error of the pose, m and rad.
-
-    Raises:
-        ValueError: if no joint angles within the limits are found.
+    A ValueError if no joint angles within the limits are found.
     """
     target, orientation = checked("position", position, "3"), checked("quat", quat, "4")
     orientation = orientation / number("length of quat", np.linalg.norm(orientation), above=0.0)

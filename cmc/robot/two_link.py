@@ -88,9 +88,7 @@ class TwoLinkArm:
 
         Called on an arm with other masses than the real one, it is the controller of an
         engineer who does not know the masses.
-
-        Raises:
-            ValueError: where |det J| is below a thousandth of its largest value.
+        A ValueError where |det J| is below a thousandth of its largest value.
         """
         jac = self.jacobian(q)
         if np.any(np.abs(np.linalg.det(jac)) < 1e-3 * self.lengths[0] * self.lengths[1]):
@@ -102,8 +100,7 @@ class TwoLinkArm:
     def reach(self, x: ArrayLike) -> Array:
         """Angles (..., 2) that put the tip at x, elbow down.
 
-        Raises:
-            ValueError: for points outside the annulus that the arm reaches.
+        A ValueError for points outside the annulus that the arm reaches.
         """
         x, (l1, l2) = _pair("x", x, True), self.lengths
         cosine = (np.sum(x**2, axis=-1) - l1**2 - l2**2) / (2 * l1 * l2)

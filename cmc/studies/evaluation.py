@@ -38,9 +38,7 @@ def evaluate(
     shipped, or need none. `trajectories` are those of each seed in the largest tests, others in
     proportion. Finished tests are kept in `folder` (`runs/STUDY/results`) and not repeated.
     `progress` is called with (tests done, tests in all, what is next).
-
-    Raises:
-        CheckpointError: if a file is missing, damaged or of another study, or there is none at all.
+    A CheckpointError if a file is missing, damaged or of another study, or there is none at all.
     """
     files = _files(study, names, checkpoints)
     kept = store.as_path("folder", folder or Path("runs") / study.name / "results")

@@ -28,7 +28,7 @@ The contact of the simulator is soft; how much of the result it owes to that is 
     b = 2 / (d_max T),    k = d(r) / (d_max^2 T^2 zeta^2),    solref = (T, zeta).
 
 Appendix H has T = 10 ms and zeta = 1. Tests "contact x c" multiply T of every shape that can touch
-by c: k goes with 1 / c^2, b with 1 / c. Studies `peg_push_contact_xC` train under such contact.
+by c: k goes with 1 / c^2, b with 1 / c. Study `peg_push_contact_x0.4` trains so.
 """
 
 from __future__ import annotations

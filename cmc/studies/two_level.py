@@ -101,8 +101,6 @@ def start_joints(task: PandaTaskConfig) -> Array:
     return inverse_kinematics(task.start, tool=FINGERTIP + task.peg.length)
 
 
-# -- low levels -----------------------------------------------------------------------------------
-
 Seeds = Sequence[int]
 Builder = Callable[[TwoLevelConfig, Seeds], LowLevel]
 Policy = tuple[nn.Module, LowLevel]
@@ -179,9 +177,6 @@ def _joints(config: TwoLevelConfig, seeds: Seeds) -> LowLevel:
     return JointLow(agent, seeds, JointUnits(start, half, low, high), config.joint_noise)
 
 
-# -- trainings ------------------------------------------------------------------------------------
-
-
 def two_level(low_level: Builder, relabel: bool = False) -> Callable[..., TwoLevel]:
     """A planner that learns by TD3 over a low level; relabelled sub-goals are HIRO's."""
 
@@ -214,9 +209,6 @@ def _planner(config: TwoLevelConfig, seeds: Seeds) -> tuple[PandaTask, Planning,
     return task, planning, DirectPolicy(network, squash=True), inputs
 
 
-# -- methods --------------------------------------------------------------------------------------
-
-
 def _arm(title: str, low_level: Builder, *steps: Change, relabel: bool = False) -> Method:
     """A method whose planner learns by TD3, and what it changes of the configuration."""
     return Method(title, two_level(low_level, relabel), both(*steps))
@@ -244,8 +236,7 @@ RESTING = changed(hierarchy={"low_updates": 0})
 """The low level does not learn."""
 TUNED = changed(start_gain=20.0)
 """A gain found by hand, close to the cap: what learning should find by itself."""
-AVERAGED = changed(planner={"average": 5e-4})
-"""Over about 2,000 updates of the actor, 40,000 steps; the training itself stays the same."""
+AVERAGED = changed(planner={"average": 5e-4})  # over some 2,000 updates, 40,000 steps
 GAUSSIAN = changed(hierarchy={"redraw": (0.0, 0.0), "burst": (0.0, 0.0)})
 
 

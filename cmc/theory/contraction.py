@@ -149,10 +149,6 @@ def overshoot(metric: ArrayLike) -> Array:
     return np.linalg.cond(metric_factor(metric))
 
 
-def _asked(space: AuxiliarySpace) -> None:
-    need(isinstance(space, AuxiliarySpace), "space", "an AuxiliarySpace", space)
-
-
 def theorem1_margin(
     space: AuxiliarySpace, slopes: ArrayLike, T_y_dot: ArrayLike | None = None
 ) -> Array:
@@ -164,7 +160,7 @@ def theorem1_margin(
     they differ by a factor 2. The proof's convention is used here, because only there beta is the
     rate; the text's beta is twice this number.
     """
-    _asked(space)
+    need(isinstance(space, AuxiliarySpace), "space", "an AuxiliarySpace", space)
     margin = contraction_rate(F(space, slopes))  # F1_theorem1
     if T_y_dot is not None:
         margin = margin + np.minimum(contraction_rate(F2(space, slopes, T_y_dot)), 0.0)
@@ -178,7 +174,7 @@ def theorem2_margin(space: AuxiliarySpace, slopes: ArrayLike) -> Array:
     of the module's F_ii, both positive where its eigenvalues have negative real part. A positive
     alpha is not a rate: trace -1e4 with determinant 1 decays at 1e-4.
     """
-    _asked(space)
+    need(isinstance(space, AuxiliarySpace), "space", "an AuxiliarySpace", space)
     s = checked("slopes", slopes, "... n 2", n=space.n)
     first = -(space.eigenvalues + space.gains * s[..., 0])  # eq_theorem2
     return np.stack(np.broadcast_arrays(first, -space.gains * s[..., 1]), axis=-1)
@@ -192,7 +188,7 @@ def slope_floor(space: AuxiliarySpace, alpha: float = 0.0) -> Array:
     vanish by saturation.
     """
     alpha = number("alpha", alpha, least=0.0)
-    _asked(space)
+    need(isinstance(space, AuxiliarySpace), "space", "an AuxiliarySpace", space)
     if np.any(space.gains == 0.0):
         raise ValueError("R has a zero on its diagonal: no slope helps that module")
     return np.maximum(space.eigenvalues + alpha, 0.0) / np.abs(space.gains)

@@ -190,9 +190,6 @@ def encode(panels: Sequence[Panel], data: Data, time: Source | None = None) -> d
     """One frame: layout of the panels, the status line, the times (m,), s, and the bytes.
 
     The entry `text` of `data`, if any, is the status line; `time` is that of the time cursor.
-
-    Raises:
-        ValueError: if a key is absent or an array has another shape than its layer wants.
     """
     if not isinstance(data, Mapping):
         raise ValueError(f"wanted a mapping of names to arrays, got {type(data).__name__}")

@@ -95,9 +95,6 @@ def slider(
 
     `step` is what an arrow key adds: 1, or a hundredth of the range. Whole numbers throughout make
     an integer slider.
-
-    Raises:
-        ValueError: if the numbers are not finite or not in order.
     """
     whole = isinstance(low, int) and isinstance(high, int) and isinstance(start, int | None)
     if step is None:

@@ -42,9 +42,6 @@ def around(
     """Camera that frames a ball: `radius` in m, seen from `azimuth` and `elevation` in degrees.
 
     Azimuth 0 looks from +x towards the center, 90 from +y.
-
-    Raises:
-        ValueError: for a center that is not three finite numbers, or a radius that is not positive.
     """
     middle = np.asarray(center, dtype=float)
     if middle.shape != (3,) or not np.isfinite(middle).all():

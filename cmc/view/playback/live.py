@@ -82,9 +82,6 @@ class LiveView(contextlib.AbstractContextManager["LiveView"]):
 
     The poses of `scene` are the starting ones, and cloths stay as they were. After `timeout`
     seconds without an update or a visit the server closes itself.
-
-    Raises:
-        ValueError: unless `timeout` is positive.
     """
 
     def __init__(self, scene: Any, timeout: float = 600.0) -> None:

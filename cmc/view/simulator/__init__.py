@@ -40,9 +40,6 @@ def live_page(
         arms: one, whose planner sets the sub-goals at first, or two side by side, with the first
             two policies, for which the reader sets them.
         seed: number of the seed in the last kept policy of each.
-
-    Raises:
-        ValueError: for another number of arms, or a policy that is not there.
     """
     if arms not in (1, 2) or arms > len(policies):
         raise ValueError(f"arms: wanted 1 or 2, each with a policy of {len(policies)}, got {arms}")
