@@ -218,6 +218,9 @@ def test_lengths_and_impacts_are_said(now):
     for table, length, least in (("seeds_5_9", 480_000, 0.95), ("again", 600_000, 0.96)):
         more = at(tidy(f"peg_push_{table}"))
         assert (more.step.max(), more.success.min(), more.success.max()) == (length, least, 1.0)
+    mean = at(tidy("peg_push_averaged"))
+    assert (mean.step.unique().tolist(), mean.seed.tolist()) == ([480_000], list(range(10)))
+    assert sorted(round(100 * x) for x in mean.success) == [94, 97, *[100] * 8]
     early = at(tidy("peg_push").query("test == 'nominal'"), 480_000).query("method == 'ctd3'")
     assert (round(100 * early.success.mean()), early.episodes.unique().tolist()) == (98, [20])
     largest = now.groupby("method").largest_N.max()

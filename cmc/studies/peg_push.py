@@ -20,7 +20,7 @@ What the paper gives is in `cmc.envs.peg_push` and in the table `tab:para`. Devi
 6. Low level: as in the maze (`cmc.studies.peg_maze`, 6); PPO/Control as there (8), discount .9.
 7. 3 to 5 were chosen in trainings with seeds 0 to 4. Five more seeds of C-TD3, 480,000 steps each,
    are in the table `peg_push_seeds_5_9`; another run of seeds 0 to 4, in which only rounding
-   differed, is in `peg_push_again`.
+   differed, is in `peg_push_again`; ten with an averaged planner are in `peg_push_averaged`.
 
 The contact of the simulator is soft; how much of the result it owes to that is tested too. MuJoCo
 (documentation, "Solver parameters") resolves a contact of depth r by a = -b v - k r with
