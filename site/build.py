@@ -91,7 +91,8 @@ def lay_out(source: Path, only: Sequence[str] | None) -> list[Path]:
 
 def execute(notebooks: Sequence[Path], jobs: int) -> None:
     """Run notebooks in place, in fast mode, with sliders that live without a kernel."""
-    settings = {"CMC_FAST": "1", "CMC_EXPORT": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "notebooks")])  # for the exercises
+    settings = {"CMC_FAST": "1", "CMC_EXPORT": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": paths}
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--nbmake"]
     command += ["--overwrite", "-n", str(jobs), *map(str, notebooks)]
     subprocess.run(command, check=True, cwd=ROOT, env={**os.environ, **settings})

@@ -126,7 +126,7 @@ def test_a_table_of_nothing_is_refused(settings, seeds, message):
 
 def test_a_table_is_computed_by_one_command(tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(softness, "CONFIGS", {"soft": SOFT})
-    monkeypatch.setattr(softness, "wander", lambda *_: {})
+    monkeypatch.setattr(softness, "_wander", lambda *_: {})
     assert main(["evaluate", "softness", "--out", str(tmp_path)]) == 0
     assert str(tmp_path / "softness.csv") in capsys.readouterr().out
     found = results.read(tmp_path / "softness.csv")

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from cmc import plants
-from cmc.policies import ConvexGradientNetwork, ModularPolicy, PositiveNetwork
+from cmc.policies import ConvexGradientNetwork, LinearNetwork, ModularPolicy, PositiveNetwork
 from cmc.theory.auxiliary import AuxiliarySpace, decompose
 from cmc.theory.certificates import circle_criterion, common_metric
 from cmc.theory.certify import certify
@@ -271,3 +271,21 @@ def test_slopes_are_probed_in_the_units_in_which_they_vary():
     answer = certify(Narrow(), plants.LinearPlant([[-1.5e5]], [[474.0]]))
     assert answer.refused
     assert "its slopes reach" in answer.reason
+
+
+@pytest.mark.parametrize("offset", np.arange(0.1, 4.0, 0.5))
+def test_the_point_of_rest_is_found_where_the_loop_starts_on_it(offset):
+    """y' = -2 y + 3 u + c, held at y = 0 by u0: the residual there is rounding alone."""
+    plant = plants.Plant.from_function(
+        lambda y, u: [-2 * y[0] + 3 * u[0] + offset], y=([-1.0], [1.0]), u=(-5.0, 5.0)
+    )
+    net = PositiveNetwork(1, hidden=(4,), bias=False, slope_min=0.5, slope_max=1.0)
+    answer = certify(ModularPolicy(net, u0=plant.hold([0.0])), plant)
+    assert answer
+    np.testing.assert_allclose(answer.rest, 0.0, atol=1e-6)  # the network is in float32
+    assert 0.0 < answer.ball < np.inf
+
+
+def test_fixed_gains_are_certified():
+    fixed = ModularPolicy(LinearNetwork([[1.0, 0.5], [1.0, 0.5]]))
+    assert certify(fixed, plants.get("coupled_lags"))

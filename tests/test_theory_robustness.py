@@ -171,6 +171,7 @@ EYE, FOUND = np.eye(2), circle_criterion(2.0, 0.8, 2.4)
         (lambda: ErrorBall(EYE, 1.0).bound(-1.0, 0.0, 1.0), "time needs"),
         (lambda: ErrorBall.of(circle_criterion(0.1, 0.8, 2.4)), "without a certificate"),
         (lambda: ErrorBall.of(FOUND, period=0.01), "does not go with"),
+        (lambda: ErrorBall.of(replace(FOUND, kind="frozen")), "without a certificate"),
         (lambda: ErrorBall(EYE, 1.0).output_bound("abc", 0.0, 0.0, 1.0), "row needs real numbers"),
         (lambda: ErrorBall.of(EYE), "certificate needs a Certificate"),
         (lambda: random_disturbances(np.random.default_rng(0), 0, 1, 1.0, step=0.1), "steps needs"),

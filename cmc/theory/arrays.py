@@ -82,12 +82,11 @@ def number(name: str, value: ArrayLike, **bounds: Any) -> float:
 
 
 def filled(name: str, value: ArrayLike, *shape: int, **bounds: Any) -> Array:
-    """Return `value`, a number or what broadcasts, as a new array of a shape; see `checked`."""
+    """Return `value`, a number or the last axes of a shape, as a new array of it; see `checked`."""
     array = checked(name, value, **bounds)
-    try:
-        return np.broadcast_to(array, shape).copy()
-    except ValueError:
-        raise ValueError(f"{name} needs a number or shape {shape}, got {array.shape}") from None
+    if array.ndim and array.shape != shape[-array.ndim :]:
+        raise ValueError(f"{name} needs a number or shape {shape}, got {array.shape}")
+    return np.broadcast_to(array, shape).copy()
 
 
 def count(name: str, value: float, most: int = 1_000_000) -> int:

@@ -41,7 +41,7 @@ def _rest_point(loop: Loop, keep: Array) -> Array | None:
         return differences(residual, x, 1e-6 * (np.abs(x) + 1e-3 * np.abs(x).max() + 1e-6))
 
     try:
-        start[keep], lost = root(residual, jacobian, start[keep])
+        start[keep], lost = root(residual, jacobian, start[keep], 1e-12)
     except (ValueError, TypeError, np.linalg.LinAlgError):
         return None
     return None if lost else start

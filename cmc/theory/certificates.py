@@ -21,7 +21,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cmc.theory.arrays import Array, checked, filled, number
+from cmc.theory.arrays import Array, checked, number
 from cmc.theory.contraction import metric_factor, overshoot
 from cmc.theory.metric_search import condition_metric, search_metric
 
@@ -230,7 +230,8 @@ def rates_in(
     theta = metric_factor(metric)
     vertices = checked("vertices", vertices, "V m m", m=len(theta))
     h = None if h is None else number("h", h, above=0.0)
-    off = filled("slack", 0.0 if slack is None else slack, *theta.shape, least=0.0)
+    n = len(theta)
+    off = 0.0 if slack is None else checked("slack", slack, "n n", n=n, least=0.0)
     inverse = np.linalg.inv(theta)
     rates = np.empty(len(vertices))
     for start in range(0, len(vertices), _CHUNK):

@@ -109,11 +109,11 @@ def jacobian_fault(plant: Any, low: Array, high: Array) -> str:
 
 
 def root(
-    f: Callable[[Array], Array], jacobian: Callable[[Array], Array], x: Array
+    f: Callable[[Array], Array], jacobian: Callable[[Array], Array], x: Array, floor: float = 0.0
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Newton's method with halved steps from x (..., m): what it finds, and where it finds no root.
 
-    A LinAlgError says that a Jacobian (..., m, m) on the way is singular.
+    A residual of `floor` counts as none. A singular Jacobian (..., m, m) is a LinAlgError.
     """
     r = np.asarray(f(x), dtype=float)
     scale = size = np.linalg.norm(r, axis=-1)
@@ -121,7 +121,7 @@ def root(
         J = jacobian(x)
         move = -np.linalg.solve(J, r[..., None])[..., 0]
         length = np.ones_like(size)
-        met = size <= 1e-13 * (scale + np.linalg.norm(J @ x[..., None], axis=(-2, -1)))
+        met = size <= floor + 1e-13 * (scale + np.linalg.norm(J @ x[..., None], axis=(-2, -1)))
         for _ in range(30):
             ahead = np.asarray(f(x + length[..., None] * move), dtype=float)
             worse = ~(np.linalg.norm(ahead, axis=-1) < size) & ~met
@@ -135,7 +135,7 @@ def root(
         if met.all() or (np.abs(step) <= 1e-14 * np.abs(x)).all():
             break
     rounding = 1e-13 * np.linalg.norm(J, axis=(-2, -1)) * np.linalg.norm(x, axis=-1)
-    return x, ~(size <= 1e-9 * scale + rounding)
+    return x, ~(size <= 1e-9 * scale + rounding + floor)
 
 
 def equilibrium(plant: Any, y: ArrayLike, t: float = 0.0) -> Array:

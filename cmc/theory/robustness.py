@@ -65,7 +65,7 @@ class ErrorBall:
         B is (n, m); a period (s) goes with a certificate of a sampled loop.
         """
         need(isinstance(certificate, Certificate), "certificate", "a Certificate", certificate)
-        if not certificate.holds or certificate.metric is None:
+        if not certificate.holds or certificate.metric is None or certificate.kind == "frozen":
             raise ValueError(f"no error ball without a certificate: {certificate}")
         if (certificate.domain == "sampled") != (period is not None):
             raise ValueError(f"domain {certificate.domain!r} does not go with period {period!r}")

@@ -62,7 +62,7 @@ def _in_double(policy: Any) -> Callable[[Array], Array]:
         name = type(policy).__name__
         raise TypeError(f"{name} sees a part of an observation, not (z, int z): pass a function")
     network = copy.deepcopy(getattr(policy, "network", policy)).double()
-    like = next(network.parameters())
+    like = next(iter([*network.parameters(), *network.buffers()]))  # fixed gains are buffers
     end = np.tanh if getattr(policy, "squash", False) else np.asarray
     return lambda s: end(network(like.new_tensor(s)).detach().numpy())
 
