@@ -17,6 +17,7 @@ import contextlib
 import io
 import os
 import runpy
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,6 +26,8 @@ from typing import Any
 import nbformat
 
 NOTEBOOKS = Path(__file__).resolve().parent.parent / "notebooks"
+if str(NOTEBOOKS) not in sys.path:  # a kernel starts beside its notebook, and `exercises` is there
+    sys.path.append(str(NOTEBOOKS))
 
 
 def cells(number: str, plant: str | None = None) -> list[Any]:
