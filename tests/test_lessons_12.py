@@ -243,6 +243,19 @@ def test_the_largest_forces_are_landings_and_misses_rest_in_one_place():
     assert missed.between(0.645, 0.67).all()
 
 
+def test_more_steps_of_the_papers_scheme():
+    long = tidy("peg_push_paper_3M").set_index("step")
+    assert (len(long), long.index[-1], long.touched.max()) == (50, 3_000_000, 0.0)
+    assert long["return"].idxmax() == 900_000
+    best = long.loc[900_000]
+    assert (round(best["return"]), round(best.final_mm, 1)) == (-135, 1.5)
+    assert round(long["return"].iloc[-1]) == -1037
+    assert (long["return"].loc[1_080_000:] > -800).sum() == 1
+    early = long.loc[660_000:960_000]
+    assert early[["slope_x", "slope_z"]].max(axis=None) < 0.05
+    assert early.slope_y.loc[900_000] > 5
+
+
 def test_from_a_slope_set_by_hand_learning_has_nothing_to_win(now):
     shares = {name: 100 * by(now, name) for name in ("ctd3_tuned", "frozen_tuned")}
     assert [round(part.mean()) for part in shares.values()] == [82, 99]
