@@ -15,7 +15,7 @@ WIDGETS = "application/vnd.jupyter.widget-state+json"
 
 
 def hidden_errors(notebook: Any) -> list[str]:
-    """Errors inside of widgets, callbacks' tracebacks, undescribed figures, stubs that pass."""
+    """Errors in widgets, tracebacks and warnings that were printed, undescribed figures, stubs."""
     found = []
     for number, cell in enumerate(notebook.cells):
         if cell.cell_type != "code":
@@ -42,8 +42,8 @@ def hidden_errors(notebook: Any) -> list[str]:
 
 def _problems(output: Any) -> list[str]:
     if output.output_type == "stream":
-        traced = "Traceback (most recent call last)" in output.text
-        return ["a traceback was printed"] if traced else []
+        signs = {"Traceback (most recent call last)": "traceback", "Warning: ": "warning"}
+        return [f"a {what} was printed" for sign, what in signs.items() if sign in output.text]
     data = output.get("data", {})
     described = str(data.get("text/plain", "")).startswith("Figure: ")
     return ["a figure without figures.describe"] if "image/png" in data and not described else []

@@ -240,6 +240,7 @@ def executed(*outputs, tags=(), state=None):
 
 
 ERROR = {"output_type": "error", "ename": "ZeroDivisionError", "evalue": "zero", "traceback": []}
+WARNED = {"name": "stderr", "text": "cell.py:4: UserWarning: will be reindexed"}
 PRINTED = {"name": "stderr", "text": "Traceback (most recent call last): a"}
 
 
@@ -249,6 +250,7 @@ PRINTED = {"name": "stderr", "text": "Traceback (most recent call last): a"}
         (executed(tags=["raises-exception"]), "raised nothing"),
         (executed(PICTURE), "a figure without figures.describe"),
         (executed({"output_type": "stream", **PRINTED}), "a traceback was printed"),
+        (executed({"output_type": "stream", **WARNED}), "a warning was printed"),
         (executed(state={"error": "ValueError: no"}), "a picture shows ValueError: no"),
         (executed(state={"outputs": [ERROR]}), "shows ZeroDivisionError: zero"),
         (executed(state={"outputs": [PRINTED]}), "an output widget shows a traceback"),
