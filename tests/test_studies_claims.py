@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
+import importlib
 import itertools
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,10 @@ import pytest
 from cmc import store
 
 SITE = Path(__file__).resolve().parent.parent / "site"
-SPEC: Any = importlib.util.spec_from_file_location("claims", SITE / "claims.py")
-claims = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(claims)
-HOLDS, FAILS, OPEN, SHORT = claims.HOLDS, claims.FAILS, claims.OPEN, claims.SHORT
+sys.path.append(str(SITE))
+rules: Any = importlib.import_module("claim_rules")
+claims: Any = importlib.import_module("claims")
+HOLDS, FAILS, OPEN, SHORT = rules.HOLDS, rules.FAILS, rules.OPEN, rules.SHORT
 FOUND = claims.answers()
 
 
@@ -156,7 +157,7 @@ GOOD, BAD = [0.9] * 5, [0.1] * 5
     ],
 )  # fmt: skip
 def test_one_rule_for_all_arms(monkeypatch, table, control, ctd3) -> None:
-    monkeypatch.setattr(claims, "table", lambda study: table)
+    monkeypatch.setattr(rules, "table", lambda study: table)
     assert claims.fails_beside("control").verdict == control
     assert claims.learns("peg_push", "ctd3", 3_000_000).verdict == ctd3
 
