@@ -233,9 +233,13 @@ def test_the_largest_forces_are_landings_and_misses_rest_in_one_place():
     study = studies.get("peg_push")
     config, found = study.config_of("ctd3"), load(study, "ctd3")
     task = config.make(5 * 4, 900_000)
-    keep = ("contact_force_max",)
-    force = play(task, config.planning(), *found.policy, 5, keep, ticks=400)[keep[0]]
+    keep = ("contact_force_max", "observation")
+    run = play(task, config.planning(), *found.policy, 5, keep, ticks=400)
+    force, seen = (run[key].reshape(400, 20, -1) for key in keep)
+    force, velocity = force[..., 0], seen[..., task.layout["velocity"]][..., :3]
     assert force.max() > 40
+    before = np.maximum(force.argmax(0) - 1, 0), np.arange(20)
+    assert 30 < 1e3 * np.median(np.linalg.norm(velocity[before], axis=-1)) < 40  # mm/s
     assert np.nonzero(force > 20)[0].max() * config.task.tick < 2.5
     each = tidy("peg_push_episodes").query("method == 'ctd3' and seed == 2 and last")
     missed = each.final_mm[each.final_mm > 0.6]

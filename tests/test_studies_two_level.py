@@ -15,17 +15,15 @@ import pytest
 from small_studies import small
 
 from cmc import store
-from cmc.__main__ import main
 from cmc.envs.peg_push import BOX_TOP, PUSH, PegPush
 from cmc.learning.low_level import LowLevel
 from cmc.robot import panda
-from cmc.studies import peg_maze, peg_push, recorded, two_level_tests
-from cmc.studies.evaluation import evaluate
+from cmc.studies import peg_maze, peg_push, two_level_tests
 from cmc.studies.peg_push import TIME_CONSTANT, scaled
 from cmc.studies.runner import load, marks_of, train
 from cmc.studies.study import Test
 from cmc.studies.two_level import TwoLevelConfig
-from cmc.studies.two_level_tests import consistency, figures, judge, motion
+from cmc.studies.two_level_tests import consistency, figures, judge
 
 MAZE, PUSHING = small(peg_maze.STUDY), small(peg_push.STUDY)
 EVERY = [(MAZE, name) for name in MAZE.methods]
@@ -232,72 +230,3 @@ def test_the_spread_without_action_is_what_the_push_does_to_the_gains_alone(monk
         spreads.append(consistency(peg_push.STUDY.config, Linear(0.0), 1, 4)["push_mm"][0])
     assert spreads[0] < 1e-12
     assert spreads[2] / spreads[1] == pytest.approx(2.0, rel=0.02)
-
-
-# -- recordings --------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short training, and a recorded episode of it."""
-    folder = tmp_path_factory.mktemp("runs")
-    both = ["peg_push", "--method", "frozen"]
-    assert main(["train", *both, "--seeds", "2", "--out", str(folder), "--steps", "160"]) == 0
-    checkpoint, out = folder / "peg_push_frozen.safetensors", folder / "episode.npz"
-    request = ["play", *both, "--seed", "1", "--episode", "3", "--checkpoint", str(checkpoint)]
-    assert main([*request, "--out", str(out)]) == 0
-    return folder
-
-
-def test_a_recording_is_the_motion_it_was_made_of(run: Path) -> None:
-    path = run / "peg_push_frozen.safetensors"
-    policy = load(peg_push.STUDY, "frozen", seed=1, path=path).policy
-    wanted = motion(peg_push.STUDY.config_of("frozen"), policy, 3)
-    found = recorded.load(run / "episode.npz")
-    for name in ("t", "qpos", "tip", "force", "distance"):
-        np.testing.assert_array_equal(found[name], wanted[name])
-    for name, value in wanted["markers"].items():
-        np.testing.assert_array_equal(found["markers"][name], value)
-    assert found["text"].endswith(wanted["text"])
-    assert found["success"] <= found["touched"]
-    assert found["record"]["seeds"] == [1]
-    data = mujoco.MjData(found["model"])
-    for k in (0, 500, 999):  # the tip is where the joints put it
-        data.qpos[:] = found["qpos"][k]
-        mujoco.mj_kinematics(found["model"], data)
-        np.testing.assert_allclose(data.site("tip").xpos, found["tip"][k], atol=1e-9)
-
-
-@pytest.mark.parametrize("kind", ["truncated", "foreign", "text", "scene"])
-def test_bad_recordings_are_refused(kind: str, run: Path, tmp_path: Path) -> None:
-    path, episode = tmp_path / "bad.npz", run / "episode.npz"
-    if kind == "truncated":
-        path.write_bytes(episode.read_bytes()[:-200])
-    elif kind == "foreign":
-        np.savez(path, a=np.zeros(3))
-    elif kind == "text":
-        path.write_text("hello")
-    else:
-        with np.load(episode) as found:
-            arrays = dict(found)
-        np.savez(path, **{**arrays, "qpos": arrays["qpos"][:, :-1]})
-    with pytest.raises(store.CheckpointError, match=r"bad\.npz"):
-        recorded.load(path)
-
-
-def test_unknown_episodes_are_named(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="episodes/none"):
-        recorded.load("none")
-    with pytest.raises(ValueError, match="lacks"):
-        recorded.save(tmp_path / "x.npz", {}, {"study": "peg_push"})
-
-
-def test_tests_under_other_contact_are_made_under_it(run: Path, tmp_path: Path) -> None:
-    tests = tuple(replace(test, methods=None) for test in peg_push.STUDY.tests[1:3])
-    study = replace(peg_push.STUDY, tests=tests)
-    options = {"checkpoints": run, "folder": tmp_path, "trajectories": 1}
-    rows = evaluate(study, ["frozen"], **options)["tests"]
-    assert [row["test"] for row in rows] == ["nominal"] * 2 + ["contact x 0.4"] * 2
-    assert "moved_mm" in rows[0]
-    assert "moved_mm" not in rows[2]
-    assert tests[1].change(study.config).task_class is scaled(0.4)
